@@ -14,8 +14,8 @@ from tinylab import bench_of
 
 import spadmnist.statistics as statistics
 from spadmnist.events import Events
+from spadmnist.inference.closed_forms import bisection
 from spadmnist.inference.laws import Exponential, Law
-from spadmnist.inference.light_levels import bisection
 from spadmnist.inference.models import Model, Packed
 from spadmnist.inference.reduction import ReducedCapture, summaries_of
 from spadmnist.inference.replicates import no_size

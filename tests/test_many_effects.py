@@ -17,7 +17,7 @@ from spadmnist.inference.elimination import drop_needless, drop_unless_missed
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.evidence import competing, leads
 from spadmnist.inference.forward_step import added_from, best_of_scan_added
-from spadmnist.inference.joint_fit import complete_fit
+from spadmnist.inference.joint_fit import complete_fit, with_own_errors
 from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin, keys_of, rests_on
@@ -43,11 +43,21 @@ def both_added(path: ModelPath) -> None:
 
 def test_the_fit_of_a_later_step_uses_the_columns_that_are_known(lab) -> None:
     """With as many simulations as the squares need; once all steps are there, the Jacobian is simulated with all."""
-    path = begin(bench_of(lab(BOTH), 16))
+    path = begin(bench_of(lab(BOTH), 32))
     both_added(path)
     assert names(path) == ["add afterpulsing", "add crosstalk"] and path.approximate
     assert path.fit is not None
-    first, kept, done = path.fit, path.kept(), path.replicates.simulations
+    first, kept = path.fit, path.kept()
+    with_own_errors(path)  # where the budget ends here
+    own = path.fit
+    assert np.array_equal(own.point, [d.coordinate(path.values[d.key]) for d in own.coordinates])
+    step = path.steps[0].values["probability"]
+    assert step.low is not None and step.high is not None
+    i = [d.key for d in own.coordinates].index(PROBABILITY)
+    half = own.coordinates[i].error(step.low, step.high)
+    assert half == pytest.approx(np.sqrt(own.covariance[i, i]), rel=0.01)
+    path.back_to(kept)
+    done = path.replicates.simulations
     complete_fit(path)
     assert not path.approximate and path.fit is not None
     assert path.replicates.simulations - done >= 2 * len(first.coordinates) * 8  # of one capture at least
@@ -56,9 +66,10 @@ def test_the_fit_of_a_later_step_uses_the_columns_that_are_known(lab) -> None:
     for i, coordinate in enumerate(path.fit.coordinates):
         if coordinate.key in (PROBABILITY, CROSSTALK, LIFETIME):
             assert abs(first.point[i] - path.fit.point[i]) < 2 * error[i]
-            # the error of a probability, which goes with its lifetime, is too small while columns are borrowed
-            ratio = np.sqrt(first.covariance[i, i]) / error[i]
-            assert 0.2 < ratio < 1 if coordinate.key == PROBABILITY else ratio == pytest.approx(1, rel=0.6)
+            # borrowed columns hold the noise of their fits, and seem to inform a probability more than they do
+            assert np.sqrt(first.covariance[i, i]) / error[i] < (0.6 if coordinate.key == PROBABILITY else 1.6)
+            # of few replicates the Jacobian lacks what may be noise: errors are too large rather than too small
+            assert 0.75 < np.sqrt(own.covariance[i, i]) / error[i] < 2.5
             truth = {PROBABILITY: 0.05, CROSSTALK: 0.03, LIFETIME: 6e-8}[coordinate.key]
             assert abs(path.fit.point[i] - coordinate.coordinate(truth)) < 4 * error[i]
     done = path.replicates.simulations

@@ -15,10 +15,10 @@ from spadmnist import measurement as measurements
 from spadmnist.effects import Conditions, DarkCounts, Detection
 from spadmnist.events import Layout
 from spadmnist.inference.candidates import candidates, maps_added, with_values
+from spadmnist.inference.closed_forms import closed_form
 from spadmnist.inference.comparison import compare
 from spadmnist.inference.count_model import light_levels_of
 from spadmnist.inference.evaluation import evaluate
-from spadmnist.inference.light_levels import closed_form
 from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.named_fit import fit_named
 from spadmnist.inference.pixel_maps import DOUBT, PixelMap, interval_of_sigma, map_values, summary

@@ -16,8 +16,9 @@ from spadmnist.effects.readout_loss import ReadoutLoss, _taken
 from spadmnist.errors import SpadError
 from spadmnist.events import Layout
 from spadmnist.inference import comparison
-from spadmnist.inference.light_levels import closed_form, in_counters, last_digit, level_for, rising_until
+from spadmnist.inference.closed_forms import closed_form, in_counters, level_for, rising_until
 from spadmnist.inference.map_models import information
+from spadmnist.inference.mean_alone import last_digit
 from spadmnist.inference.next_step import after_comparison
 from spadmnist.inference.reduction import ReducedCapture, early_ticks, reduce_with, total_of
 from spadmnist.inference.replicates import Execution, Replicates

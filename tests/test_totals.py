@@ -19,7 +19,8 @@ from spadmnist.inference.count_model import CountModel
 from spadmnist.inference.evaluation import BlockCheck, Evaluation, evaluate, failing
 from spadmnist.inference.findings import nuisances
 from spadmnist.inference.levels import FALSE_ALARM, SHARE_OF_TOTALS
-from spadmnist.inference.light_levels import CaptureNull, level_error, log_levels, of_mean, totals_space
+from spadmnist.inference.light_levels import CaptureNull, level_error, log_levels, totals_space
+from spadmnist.inference.mean_alone import of_mean
 from spadmnist.inference.replicates import TOTALS, Execution, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
@@ -157,9 +158,7 @@ def test_a_counter_has_more_than_one_detection_in_a_frame() -> None:
 
 def test_the_mean_of_a_counter_scatters_as_its_detections(lab, monkeypatch) -> None:
     replicates = bench_of(lab())
-    monkeypatch.setattr(
-        "spadmnist.inference.light_levels.closed_form", lambda sensor, capture: lambda level: 500.0 * 256
-    )
+    monkeypatch.setattr("spadmnist.inference.mean_alone.closed_form", lambda sensor, capture: lambda level: 500.0 * 256)
     monkeypatch.setattr("spadmnist.twin.photons_at", lambda capture, layout: 1.0)
     null, _ = of_mean(replicates.start, counter(100), 500.0 * 256, 16)
     assert null.scatter == pytest.approx(1 / math.sqrt(500 * 256), rel=0.1)

@@ -10,8 +10,8 @@ from scipy import stats
 
 from ..sensor import Sensor
 from .candidates import with_values
+from .closed_forms import events_in_frames, pixel_counts
 from .coordinates import Key
-from .light_levels import events_in_frames, pixel_counts
 from .models import InTheDark
 from .replicates import Replicates
 

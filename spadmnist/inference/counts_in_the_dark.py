@@ -22,9 +22,9 @@ from ..measurement import Measurement
 from ..sensor import Sensor
 from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate, with_values
+from .closed_forms import CLOSED, closed_form, error_by_causes, level_for
 from .laws import poisson_scores
 from .levels import LEAST_P
-from .light_levels import CLOSED, closed_form, error_by_causes, level_for
 from .pixel_maps import map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title

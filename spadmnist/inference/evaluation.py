@@ -18,19 +18,11 @@ from ..statistics import Summary
 from . import replicate_cache
 from .candidates import with_values
 from .captures_together import Together, checks_together
+from .closed_forms import most_detections
 from .coordinates import Key, Values
 from .levels import FALSE_ALARM, SHARE_OF_TOTALS
-from .light_levels import (
-    CaptureNull,
-    central_level,
-    law_of,
-    levels_about,
-    matched_light,
-    most_detections,
-    of_mean,
-    own_totals,
-    totals_residuals,
-)
+from .light_levels import CaptureNull, central_level, law_of, levels_about, matched_light, own_totals, totals_residuals
+from .mean_alone import of_mean
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
 from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, T, joined, no_size

@@ -21,9 +21,9 @@ from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from .candidates import Candidate, templates, with_values
+from .closed_forms import closed_form, level_for
 from .coordinates import Coordinate, Key
 from .levels import FALL_95
-from .light_levels import closed_form, level_for
 from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of, hazards_of
 from .profile_likelihood import by_simplex, maximum, profile_end
 

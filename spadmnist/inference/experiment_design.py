@@ -15,8 +15,9 @@ from ..effects import Conditions, Mimic
 from ..foreign import visible
 from ..recording import Capture, Light, Recording
 from .candidates import Candidate
+from .closed_forms import closed_form
 from .evaluation import Evaluation, evaluate, square
-from .light_levels import closed_form, level_error
+from .light_levels import level_error
 from .models import InTheDark, Model
 from .reduction import ReducedCapture
 from .replicates import FEW, CannotSimulate, Replicates, simulated

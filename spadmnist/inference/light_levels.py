@@ -6,24 +6,22 @@ uncertainty.
 
 from __future__ import annotations
 
-import decimal
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import optimize, special, stats
 
 from .. import twin
-from ..effects import Conditions, Effect
 from ..recording import Capture
 from ..sensor import Sensor
+from .closed_forms import bisection, closed_form, level_for, most_detections, rising_until
 from .laws import poisson_scores
 from .models import InTheDark
 from .reduction import ReducedCapture
-from .replicates import Replicates, simulated
+from .replicates import Replicates
 
 if TYPE_CHECKING:
     from .evaluation import Evaluation
@@ -37,18 +35,12 @@ _NOISE = 4.0  # standard deviations of the counts: within it a total is the expe
 # of a logarithm: the noise of the counts beyond which it extends the range of the replicates; the most that it counts
 _MUCH, _MOST_NOISE = 0.05, 0.7
 _DROWNED = 0.5  # of the elasticity at the stated level: below it, the total hardly depends on the light
-CLOSED = 5e-4  # relative error of the closed forms, at most: it adds to the scatter where the mean alone is known
 LEAST_ELASTICITY = 0.01  # the least elasticity of a total that informs the light level
 _MOST_LIGHT, _MOST_DARK = 1.5, 9.0  # of a logarithm, lit and dark: the most that a level moves for as many detections
 # expected detections: the least that inform the level; below the other, none are expected
 _LEAST_TOTAL, _NEVER = 5.0, 0.5
 _SOME = 0.3  # standard deviations: a smaller deviation does not determine the error of a level
 _FEW_COUNTS = 30.0  # expected detections of a lit capture: the logarithm of fewer is not normal, they have a score
-_COARSE, _FLAT = 37, 1e-6  # levels among which the largest total is looked for; relative: a fall that is none
-# events of each of so many recordings of frames, by which the closed form of their mean is corrected: together they
-# have the noise of 1e6 counts, 0.1 %, in some tenths of a second
-_SHORT, _RECORDINGS = 1.25e5, 8
-_MOMENTS, _PIXELS = 1024, 1024  # moments and pixels over which a curve of the rate is averaged, at most
 _FAINT = 1e-6  # of the stated light: as good as none, for the total in the dark
 
 
@@ -209,211 +201,6 @@ def as_expected(capture: Capture, total: float, wanted: float, most: float) -> b
     """
     free = most - wanted if math.isfinite(most) and not capture.counts_events else wanted
     return abs(total - wanted) < _NOISE * math.sqrt(max(min(free, wanted), 0.0) + 1.0)
-
-
-def most_detections(capture: Capture, pixels: int) -> float:
-    """The detections that a capture can hold; inf for time stamps."""
-    if capture.modality == "tr":
-        return math.inf
-    c = capture.conditions
-    return float(pixels * (c.count_frames * c.largest_count if capture.modality == "counts" else c.frames))
-
-
-def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> tuple[CaptureNull, np.ndarray]:
-    """(null distribution of a capture whose mean alone is known, (replicates,) factors on its level).
-
-    It is by the closed forms of the effects. Its scatter is that of the counts, of the last digit of the mean, and of
-    the closed forms. What rates that
-    fluctuate do to the mean of frames is no part of them.
-
-    Args:
-        total: detections of the whole array.
-        replicates: their number.
-    """
-    dark = capture.light.dark
-    stated = 1.0 if dark else twin.photons_at(capture, sensor.layout)
-    expected = closed_form(InTheDark.of(sensor) if dark else sensor, capture)
-    level = stated if stated is not None else level_for(expected, total, None)
-    mean = max(expected(level), 1e-9)
-    share = 1.0 if capture.counts_events else 1 - min(mean / sensor.layout.pixels / capture.conditions.frames, 1.0)
-    digits, expected_mean = total / sensor.layout.pixels, mean / sensor.layout.pixels
-    rounding = last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
-    caused = error_by_causes(sensor, capture)
-    apart, unsure = (
-        (0.0, 0.0) if capture.counts_events or not sensor.at("arrival") else _of_fluctuations(sensor, capture, level)
-    )
-    scatter = math.sqrt(share / mean + rounding**2 + CLOSED**2 + caused**2 + unsure**2)
-    normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
-    order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
-    totals = mean * np.exp(apart + scatter * normal[order])
-    return CaptureNull(level, stated, totals, expected, (apart, 1.0), scatter), np.ones(replicates)
-
-
-def error_by_causes(sensor: Sensor, capture: Capture) -> float:
-    """The relative error of the closed form of the mean, by what events cause; at most.
-
-    An afterpulse in the frame of its parent is no further detection, and by the closed form it may be one. Where all
-    detections are counted, the closed form lacks those that are caused by a caused one.
-    """
-    caused = sum(sensor.caused().values())
-    return caused**2 if capture.counts_events else caused
-
-
-def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:
-    """(log of the share of frames with a detection over that of a steady rate, its standard error).
-
-    Of a rate that follows a curve it is the mean over the exposure; of one that is drawn, that of short recordings.
-    """
-    sensor = InTheDark.of(sensor) if capture.light.dark else sensor
-    curves = [effect for effect in sensor.at("arrival") if hasattr(effect, "factor")]
-    drawn = [effect for effect in sensor.at("arrival") if not hasattr(effect, "factor")]
-    apart, c = _of_curves(sensor, curves, capture, level), capture.conditions
-    if not drawn:
-        return apart, 0.0
-    steady = sensor.changed(effects=[effect for effect in sensor.effects if effect not in curves])
-    steady = InTheDark.of(steady) if capture.light.dark else steady
-    events = float(steady.expected(np.full((1, sensor.layout.pixels), level), c)[0].sum())
-    frames = max(math.ceil(c.frames * min(_SHORT / max(events, 1.0), 1.0)), 1)
-    clock = replace(c, frames=frames, exposure=frames * c.frame_period, bits=0)
-    short = replace(capture, modality="qis", mean=None, conditions=clock)  # a sum of frames has as many
-    numbers = np.arange(_RECORDINGS, dtype=np.uint64)
-    made = simulated(steady, short, np.full(_RECORDINGS, level), numbers, 0)
-    logs = np.log([max(float(recording.totals.sum()), 0.5) for recording in made])
-    apart += float(logs.mean()) - math.log(closed_form(steady, short)(level))
-    return apart, float(np.std(logs, ddof=1)) / math.sqrt(_RECORDINGS)
-
-
-def _of_curves(sensor: Sensor, curves: Sequence[Effect], capture: Capture, level: float) -> float:
-    """The log of the share of frames with a detection over that of the mean rate, where the rate follows curves."""
-    if not curves:
-        return 0.0
-    light: np.ndarray = np.full((1, sensor.layout.pixels), level)
-    some = slice(None, None, -(-sensor.layout.pixels // _PIXELS))
-    rate, lit = (part[0, some] for part in sensor.rates(light, capture.conditions))
-    events = events_in_frames(sensor, light, capture.conditions)[0, some]
-    times = capture.conditions.within_frames.moments(_MOMENTS)
-    swing = np.zeros((_MOMENTS, 1))
-    for effect in curves:
-        factor: np.ndarray = np.ravel(effect.factor(times, capture.conditions))[:, None]  # type: ignore[attr-defined]
-        share = lit / np.maximum(rate, 1e-300) if effect.acts_on == "light" else 1.0
-        swing = swing + share * (factor / factor.mean() - 1)
-    there = -np.expm1(-events * np.maximum(1 + swing, 0.0))
-    return math.log(float(there.mean(axis=0).sum()) / float(-np.expm1(-events).sum()))
-
-
-def last_digit(value: float) -> float:
-    """The last decimal place of a number as written: 0.1 of 2.6, 1 of 470."""
-    return 10.0 ** int(decimal.Decimal(f"{value:.10g}").as_tuple().exponent)
-
-
-def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
-    """The function level -> detections of the whole array, by the effects' closed forms."""
-    counts = pixel_counts(sensor, capture)
-
-    @functools.lru_cache(maxsize=4096)
-    def detections(level: float) -> float:
-        return max(float(counts(level).sum()), 1e-9)
-
-    return detections
-
-
-def pixel_counts(sensor: Sensor, capture: Capture) -> Callable[[float], np.ndarray]:
-    """The function level -> (pixels,) expected detections of each pixel, by the effects' closed forms.
-
-    Nothing is recorded in gaps between frames, and no counter counts beyond its largest count.
-    """
-    conditions = capture.conditions
-
-    def counts(level: float) -> np.ndarray:
-        light = np.full((1, sensor.layout.pixels), level)
-        if capture.counts_events:
-            made = sensor.expected(light, conditions.within_frames, capture.modality == "tr")[1][0]
-        else:
-            made = conditions.frames * in_frames(sensor, light, conditions)[0]
-        if full is not None:
-            mean = made / conditions.count_frames
-            if np.any(mean + 10 * np.sqrt(mean) + 10 > full):  # otherwise none is full
-                made = in_counters(mean, full, slots) * conditions.count_frames
-        return np.asarray(made)
-
-    full, slots = None, math.inf
-    if capture.modality == "counts":
-        full = sensor.full_counts(conditions)
-        if conditions.counting == "frames":
-            slots = float(conditions.largest_count)
-            full = full if np.any(full < slots) else None  # by itself a sum of binary frames does not pile up
-    return counts
-
-
-def in_counters(mean: np.ndarray, full: np.ndarray, slots: float) -> np.ndarray:
-    """The expected counts of counters that stop, E[min(N, full)], (pixels,).
-
-    N is binomial, or Poisson where the slots have no end; a dead time makes it scatter less.
-
-    Args:
-        mean: (pixels,) events in a count frame.
-        full: (pixels,) the largest count.
-        slots: binary frames in a count frame; inf for a counter.
-    """
-    if math.isinf(slots):
-        below, beyond = special.pdtr(full - 1, mean), special.pdtrc(full, mean)
-    else:
-        share, never = np.minimum(mean / slots, 1.0), full >= slots
-        below = np.where(never, 1.0, stats.binom.cdf(full - 1, slots - 1, share))
-        beyond = np.where(never, 0.0, stats.binom.sf(full, slots, share))
-    return np.asarray(mean * below + full * beyond)
-
-
-def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
-    """The expected share of frames with a detection, (images, pixels).
-
-    Args:
-        light: (images, pixels) photons/s.
-    """
-    return np.asarray(-np.expm1(-events_in_frames(sensor, light, conditions)))
-
-
-def events_in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
-    """The expected events in a frame, of which the first is detected, (images, pixels).
-
-    Args:
-        light: (images, pixels) photons/s.
-        conditions: of so many ticks of each frame, these begin where the sensor's converter counts them from.
-    """
-    within = conditions.within_frames
-    if conditions.live is not None:
-        within = replace(conditions, live=max(conditions.live + sensor.origin, 0.0))
-    return np.asarray(sensor.expected(light, within)[0] / conditions.frames)
-
-
-def level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:
-    """The level at which this total is expected; the stated one where there is none."""
-    found = bisection(expected, total, 1e-6, rising_until(expected, 1e-6, 1e12))
-    return found if 1e-5 < found < 1e11 else stated or 1.0
-
-
-def bisection(expected: Callable[[float], float], total: float, low: float, high: float) -> float:
-    """The level between `low` and `high` at which this total is expected, to the last digit of a double."""
-    middle = math.sqrt(low * high)
-    while low < middle < high:
-        low, high = (middle, high) if expected(middle) < total else (low, middle)
-        middle = math.sqrt(low * high)
-    return middle
-
-
-def rising_until(expected: Callable[[float], float], low: float, high: float) -> float:
-    """The level up to which the expected detections rise: `high`, or where they are largest below it."""
-    levels = np.geomspace(low, high, _COARSE)
-    values = [expected(float(level)) for level in levels]
-    top = int(np.argmax(values))
-    if values[-1] >= values[top] * (1 - _FLAT):
-        return high
-    found = optimize.minimize_scalar(
-        lambda x: -expected(math.exp(x)),
-        bounds=(math.log(levels[max(top - 1, 0)]), math.log(levels[top + 1])),
-        method="bounded",
-    )
-    return math.exp(float(found.x))
 
 
 @dataclass(frozen=True)

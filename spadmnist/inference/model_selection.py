@@ -37,7 +37,7 @@ from .forward_step import (
     with_more_replicates,
 )
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
-from .joint_fit import completed
+from .joint_fit import completed, with_own_errors
 from .journal import Journal
 from .levels import CLEARLY, COST_OF_A_PARAMETER
 from .model_path import ModelPath, begin
@@ -139,6 +139,11 @@ def _diagnosed(
         with or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
         take_setup_again(path, notes)
+        if path.approximate:  # no answer is without errors of its own
+            replicates.budget.until = math.inf
+            with or_as_before(path, "the intervals"):
+                with_own_errors(path)
+            replicates.budget.until = FITS
     if path.steps and not short and not notes.explained:  # the rates follow from the stated light
         with or_as_before(path, "the fit by likelihood"):
             sharpen(path, replicates.measurement)

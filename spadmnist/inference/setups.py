@@ -20,9 +20,10 @@ from scipy import stats
 from .. import twin
 from ..errors import UNABLE
 from .candidates import templates
+from .closed_forms import closed_form, level_for
 from .evaluation import Evaluation, square, with_totals_anew
 from .levels import COST_OF_A_PARAMETER, FALSE_ALARM, HALF_95
-from .light_levels import closed_form, level_for, totals_space
+from .light_levels import totals_space
 from .models import InTheDark
 from .replicates import TOTALS, CannotSimulate, Replicates, simulated
 from .results import plain

@@ -1,0 +1,147 @@
+"""Closed forms: the detections that a capture has on average, as a function of the light, and the light by them."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy import optimize, special, stats
+
+from ..effects import Conditions
+from ..recording import Capture
+from ..sensor import Sensor
+
+# A value without another reason is a rule of thumb: no measurement that is kept chose it.
+CLOSED = 5e-4  # relative error of the closed forms, at most: it adds to the scatter where the mean alone is known
+_COARSE, _FLAT = 37, 1e-6  # levels among which the largest total is looked for; relative: a fall that is none
+
+
+def error_by_causes(sensor: Sensor, capture: Capture) -> float:
+    """The relative error of the closed form of the mean, by what events cause; at most.
+
+    An afterpulse in the frame of its parent is no further detection, and by the closed form it may be one. Where all
+    detections are counted, the closed form lacks those that are caused by a caused one.
+    """
+    caused = sum(sensor.caused().values())
+    return caused**2 if capture.counts_events else caused
+
+
+def closed_form(sensor: Sensor, capture: Capture) -> Callable[[float], float]:
+    """The function level -> detections of the whole array, by the effects' closed forms."""
+    counts = pixel_counts(sensor, capture)
+
+    @functools.lru_cache(maxsize=4096)
+    def detections(level: float) -> float:
+        return max(float(counts(level).sum()), 1e-9)
+
+    return detections
+
+
+def pixel_counts(sensor: Sensor, capture: Capture) -> Callable[[float], np.ndarray]:
+    """The function level -> (pixels,) expected detections of each pixel, by the effects' closed forms.
+
+    Nothing is recorded in gaps between frames, and no counter counts beyond its largest count.
+    """
+    conditions = capture.conditions
+
+    def counts(level: float) -> np.ndarray:
+        light = np.full((1, sensor.layout.pixels), level)
+        if capture.counts_events:
+            made = sensor.expected(light, conditions.within_frames, capture.modality == "tr")[1][0]
+        else:
+            made = conditions.frames * in_frames(sensor, light, conditions)[0]
+        if full is not None:
+            mean = made / conditions.count_frames
+            if np.any(mean + 10 * np.sqrt(mean) + 10 > full):  # otherwise none is full
+                made = in_counters(mean, full, slots) * conditions.count_frames
+        return np.asarray(made)
+
+    full, slots = None, math.inf
+    if capture.modality == "counts":
+        full = sensor.full_counts(conditions)
+        if conditions.counting == "frames":
+            slots = float(conditions.largest_count)
+            full = full if np.any(full < slots) else None  # by itself a sum of binary frames does not pile up
+    return counts
+
+
+def in_counters(mean: np.ndarray, full: np.ndarray, slots: float) -> np.ndarray:
+    """The expected counts of counters that stop, E[min(N, full)], (pixels,).
+
+    N is binomial, or Poisson where the slots have no end; a dead time makes it scatter less.
+
+    Args:
+        mean: (pixels,) events in a count frame.
+        full: (pixels,) the largest count.
+        slots: binary frames in a count frame; inf for a counter.
+    """
+    if math.isinf(slots):
+        below, beyond = special.pdtr(full - 1, mean), special.pdtrc(full, mean)
+    else:
+        share, never = np.minimum(mean / slots, 1.0), full >= slots
+        below = np.where(never, 1.0, stats.binom.cdf(full - 1, slots - 1, share))
+        beyond = np.where(never, 0.0, stats.binom.sf(full, slots, share))
+    return np.asarray(mean * below + full * beyond)
+
+
+def in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """The expected share of frames with a detection, (images, pixels).
+
+    Args:
+        light: (images, pixels) photons/s.
+    """
+    return np.asarray(-np.expm1(-events_in_frames(sensor, light, conditions)))
+
+
+def events_in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """The expected events in a frame, of which the first is detected, (images, pixels).
+
+    Args:
+        light: (images, pixels) photons/s.
+        conditions: of so many ticks of each frame, these begin where the sensor's converter counts them from.
+    """
+    within = conditions.within_frames
+    if conditions.live is not None:
+        within = replace(conditions, live=max(conditions.live + sensor.origin, 0.0))
+    return np.asarray(sensor.expected(light, within)[0] / conditions.frames)
+
+
+def most_detections(capture: Capture, pixels: int) -> float:
+    """The detections that a capture can hold; inf for time stamps."""
+    if capture.modality == "tr":
+        return math.inf
+    c = capture.conditions
+    return float(pixels * (c.count_frames * c.largest_count if capture.modality == "counts" else c.frames))
+
+
+def level_for(expected: Callable[[float], float], total: float, stated: float | None) -> float:
+    """The level at which this total is expected; the stated one where there is none."""
+    found = bisection(expected, total, 1e-6, rising_until(expected, 1e-6, 1e12))
+    return found if 1e-5 < found < 1e11 else stated or 1.0
+
+
+def bisection(expected: Callable[[float], float], total: float, low: float, high: float) -> float:
+    """The level between `low` and `high` at which this total is expected, to the last digit of a double."""
+    middle = math.sqrt(low * high)
+    while low < middle < high:
+        low, high = (middle, high) if expected(middle) < total else (low, middle)
+        middle = math.sqrt(low * high)
+    return middle
+
+
+def rising_until(expected: Callable[[float], float], low: float, high: float) -> float:
+    """The level up to which the expected detections rise: `high`, or where they are largest below it."""
+    levels = np.geomspace(low, high, _COARSE)
+    values = [expected(float(level)) for level in levels]
+    top = int(np.argmax(values))
+    if values[-1] >= values[top] * (1 - _FLAT):
+        return high
+    found = optimize.minimize_scalar(
+        lambda x: -expected(math.exp(x)),
+        bounds=(math.log(levels[max(top - 1, 0)]), math.log(levels[top + 1])),
+        method="bounded",
+    )
+    return math.exp(float(found.x))
