@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .levels import CLEARLY
-from .null_distribution import Null, p_of_squares, tail_of, widening
+from .null_distribution import Null, in_scatters, p_of_squares, tail_of, widening
 from .replicates import TOTALS, Cell, Replicates
 
 if TYPE_CHECKING:
@@ -123,7 +123,11 @@ def _law_of_sums(evaluation: Evaluation, cells: Sequence[Cell]) -> Null:
 
     sums = _sum([scores(cell) for cell in cells]) / math.sqrt(len(cells))
     own = np.mean(sums**2, axis=1)
-    return replace(evaluation.nulls[cells[0]], own=own, tail=tail_of(sums), recordings=len(sums))
+    null = evaluation.nulls[cells[0]]
+    contrasts = null.contrasts
+    if contrasts is not None:
+        contrasts = in_scatters(contrasts / np.linalg.norm(contrasts, axis=1, keepdims=True), sums)
+    return replace(null, own=own, tail=tail_of(sums), recordings=len(sums), contrasts=contrasts)
 
 
 def _in_squares(

@@ -216,7 +216,8 @@ def _evaluate(
             if name not in made.values:
                 continue
             kind, scale = made.laws[name]
-            null = learn([Summary(v, kind, str, no_size, scale) for v in made.values[name]], made.totals)
+            own = [Summary(v, kind, str, no_size, scale) for v in made.values[name]]
+            null = learn(own, made.totals, summary.contrasts)
             cell = id, name
             evaluation.nulls[cell] = null
             evaluation.judgements[cell] = judged = null.judge(summary.values, replicates.seen[id].total)

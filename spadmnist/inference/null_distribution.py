@@ -65,6 +65,8 @@ class Null:
         tail: the same for the largest residuals.
         own: (replicates,) mean squared residual of each replicate.
         reach: (least, most) total relative to `middle`, less 1, to which the regression is extrapolated.
+        contrasts: (patterns, cells) of the summary, each of unit length, divided by its scatter in the replicates;
+            None without any.
     """
 
     law: Law
@@ -77,6 +79,7 @@ class Null:
     tail: float
     own: np.ndarray
     reach: tuple[float, float] = (-math.inf, math.inf)
+    contrasts: np.ndarray | None = None
 
     def expected(self, total: float) -> tuple[np.ndarray, float]:
         """((cells,) expectation for a capture with this total of detections, its variance relative to the scatter)."""
@@ -112,7 +115,8 @@ class Null:
     def p_value(self, z: np.ndarray) -> tuple[float, int]:
         """(p-value of residuals, the cell of the largest one).
 
-        The p-value is twice the smaller of that of the sum of squares and that of the largest residual.
+        The p-value is twice the smaller of that of the sum of squares and that of the largest residual. Where there are
+        contrasts, it is three times the smallest, and the cell is that which contributes most to the contrast.
 
         Args:
             z: (cells,) residuals.
@@ -121,7 +125,15 @@ class Null:
         worst = int(np.argmax(np.abs(z)))
         largest = abs(float(z[worst])) / self.tail
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
-        return min(1.0, 2 * min(p_sum, p_cell)), worst
+        if self.contrasts is None:
+            return min(1.0, 2 * min(p_sum, p_cell)), worst
+        scores = self.contrasts @ z
+        clearest = int(np.argmax(np.abs(scores)))
+        # each scatter is that of so many replicates
+        p_contrast = len(scores) * 2 * float(stats.t.sf(abs(scores[clearest]), self.recordings - 1))
+        if p_contrast < min(p_sum, p_cell):
+            worst = int(np.argmax(self.contrasts[clearest] * z * np.sign(scores[clearest])))
+        return min(1.0, 3 * min(p_sum, p_cell, p_contrast)), worst
 
     def moments_of_squares(self, cells: int) -> tuple[float, float]:
         """(mean, variance) of the mean squared residual of so many cells."""
@@ -147,12 +159,13 @@ class Null:
         return self.law.spread_at(expected, self.spread, self.factor)
 
 
-def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
+def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarray | None = None) -> Null:
     """The null distribution of one statistic, from the model's replicates.
 
     Args:
         summaries: one for each replicate.
         totals: (replicates,) detections of the whole array.
+        contrasts: (patterns, cells) of the measured summary.
     """
     first = summaries[0]
     law = law_of(first.law, first.scale is not None)
@@ -183,7 +196,19 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray) -> Null:
     z = z / factor
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-    return Null(law, middle, coefficients, inverse, spread, n, factor, tail_of(z), np.mean(z**2, axis=1), reach)
+    own, known = np.mean(z**2, axis=1), None if contrasts is None else in_scatters(contrasts, z)
+    return Null(law, middle, coefficients, inverse, spread, n, factor, tail_of(z), own, reach, known)
+
+
+def in_scatters(contrasts: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Contrasts divided by their scatter in replicates, which is at least that of independent cells.
+
+    Args:
+        contrasts: (patterns, cells), each of unit length.
+        z: (replicates, cells) residuals.
+    """
+    scatter = np.sqrt(np.mean((z @ contrasts.T) ** 2, axis=0))
+    return np.asarray(contrasts / np.maximum(scatter, 1.0)[:, None])
 
 
 def _terms(x: np.ndarray, terms: int) -> np.ndarray:

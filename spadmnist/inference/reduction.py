@@ -205,6 +205,11 @@ def _problem(found: Summary) -> tuple[str, str] | None:
         column = getattr(found, name)
         if column is not None and np.shape(column) != values.shape:
             return f"has {name} of shape {np.shape(column)}", f"it has a number for each cell, {values.shape}"
+    shape = np.shape(found.contrasts) if found.contrasts is not None else (1, values.size)
+    if len(shape) != 2 or shape[1] != values.size or not shape[0]:
+        return f"has contrasts of shape {shape}", f"they are (patterns, cells), of {values.size} cells"
+    if found.contrasts is not None and not np.allclose(np.linalg.norm(found.contrasts, axis=1), 1.0):
+        return "has contrasts that are not of unit length", "the squares of each pattern add up to 1"
     if found.scale is not None and not np.all((np.asarray(found.scale) >= 0) & (np.asarray(found.scale) < np.inf)):
         return "has a scale that is negative or not finite", "it is the size of the spread of each cell"
     if found.shape is not None and int(np.prod(found.shape)) != values.size:

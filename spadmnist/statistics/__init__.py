@@ -42,7 +42,9 @@ class Summary:
     physical units, as text, and as a share of the detections or of the rate (for `--tolerance`).
     axis: (cells,) what a picture has on its horizontal axis, and its label; log: on a logarithmic scale. shape: (rows,
     columns) where the cells are a map of the array. nested: (cells,) of normal scores of which each is of what the one
-    before is of and of more, as counts in windows twice as long: their correlation with that one.
+    before is of and of more, as counts in windows twice as long: their correlation with that one. contrasts: (patterns,
+    cells) of independent cells, each of unit length: a deviation of this pattern is tested by itself, for one that is
+    spread over all cells is lost in the sum of their squares.
     """
 
     values: np.ndarray
@@ -55,6 +57,7 @@ class Summary:
     log: bool = False
     shape: tuple[int, int] | None = None
     nested: np.ndarray | None = None
+    contrasts: np.ndarray | None = None
 
     def apart(self) -> Summary:
         """The same, but of a nested cell what it does not share with the one before: cells that are independent."""

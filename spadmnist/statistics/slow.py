@@ -21,6 +21,7 @@ _BLOCKS = 32
 _LENGTHS = (128, 32, 8)  # blocks of the capture
 _HOTTEST = (0.02, 0.05, 0.1, 0.2)  # of the pixels
 _FEWEST = 10  # pixels
+_COURSES = 3  # patterns of a slow course: a rise, a bend, a turn
 
 
 @jit
@@ -137,6 +138,12 @@ def _block_time(recording: Recording, blocks: int) -> float:
     return conditions.frame_period * merged * (recording.n_frames // blocks)
 
 
+def slow_courses(blocks: int) -> np.ndarray:
+    """A rise, a bend and a turn over the blocks, (patterns, blocks): Legendre polynomials, orthonormal."""
+    powers = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, blocks), _COURSES)
+    return np.asarray(np.linalg.qr(powers)[0].T[1:])
+
+
 def _of_blocks(series: np.ndarray, blocks: int) -> np.ndarray:
     """(blocks,) sums of a series over frames (frames,); those left over are left out."""
     size = len(series) // blocks
@@ -147,7 +154,8 @@ class Trend(Statistic):
     """Detections of the array in 32 blocks of the capture, relative to their mean.
 
     Captures with few frames have 16 blocks. First stamps: detections for equal times of waiting (see `pixel_map`).
-    Law: normal, as scores of Poisson counts given their total; all blocks have the same spread.
+    Law: normal, as scores of Poisson counts given their total; all blocks have the same spread. A rise, a bend and a
+    turn over all blocks are tested by themselves.
     Shows: a light source that drifts, slow flicker, warming up, a readout that stops for a while.
     """
 
@@ -196,6 +204,7 @@ class Trend(Statistic):
             scale=np.ones(blocks),
             axis=(np.arange(blocks) + 0.5) * length,
             label="time, s",
+            contrasts=slow_courses(blocks),
         )
 
 
