@@ -168,7 +168,7 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.folder)
     (folder / "answers").mkdir(exist_ok=True)
     args.able = {verb: has_verb(verb) for verb in ("compare", "diagnose")}
-    args.one_job = {verb: able and has_verb(verb, "--jobs") for verb, able in args.able.items()}
+    args.takes_jobs = {verb: able and has_verb(verb, "--jobs") for verb, able in args.able.items()}
     args.until = time.monotonic() + 60 * args.minutes
     if not args.able["diagnose"]:
         print("challenge: this spadmnist has no verb diagnose; its answers will be missing", file=sys.stderr)
@@ -254,8 +254,8 @@ def ask(folder: Path, question: str, case: str, args: argparse.Namespace) -> tup
     told.unlink(missing_ok=True)
     verb = "diagnose" if question == "diagnose" else "compare"
     options = ["--json", str(told), "--seed", "0"]
-    if args.one_job[verb]:
-        options += ["--jobs", "1"]
+    if args.takes_jobs[verb]:
+        options += ["--jobs", str(max((os.cpu_count() or 1) // args.jobs, 1))]
     if verb == "diagnose":
         shutil.rmtree(found, ignore_errors=True)
         answer_file(folder, case, "unseen-found").unlink(missing_ok=True)
@@ -385,7 +385,9 @@ def main(arguments: list[str] | None = None) -> int:
     making.add_argument("--jobs", type=int, default=processors)
     running = verbs.add_parser("run", help="spadmnist compare and diagnose over all cases; again: what is missing")
     running.add_argument("folder", metavar="FOLDER")
-    running.add_argument("--jobs", type=int, default=2, help="cases at a time [2]")
+    running.add_argument(
+        "--jobs", type=int, default=2, help="cases at a time, which share the cores; on slow ones 1 [2]"
+    )
     running.add_argument("--quick", action="store_true", help="diagnose --quick")
     running.add_argument("--within", metavar="TIME", help="diagnose --within TIME [its default]")
     running.add_argument("--ask", nargs="+", choices=QUESTIONS, default=QUESTIONS, help="these questions only")
