@@ -10,6 +10,30 @@ event        one entry of a stream
 exposure     how long an image is recorded; frame: a slice of it, frame time: how long a frame looks
 TR           every detection's time stamp; STR: the first one of each frame; QIS: one bit a frame
 effect       one physical cause, in one file, at one stage of the line from photons to readouts
+
+The words of the inference; a cell is one number of a statistic, a candidate one change of the model:
+
+replicate             a recording that the model makes of a capture; all models draw the same random numbers for it
+null distribution     how a statistic is distributed if the model is right
+residual              measured less expected, in units of the cell's scatter; misfit: the mean square of residuals
+nuisance parameter    a number that is fitted and not asked for: the light level of a capture
+signature             the shift of every cell that a candidate makes, in proportion to its strength
+score test            the data's projection on a signature, in standard deviations of the null distribution
+trials factor         the effective number of independent tests of which the smallest p-value is the best
+covariance            of fitted numbers: how their errors go together; the diagonal has their variances
+profile likelihood    the largest likelihood at one value of a number; its fall by a given amount ends an interval
+random effect         values of pixels, rows or columns that are draws from one law; its width is fitted
+empirical Bayes       a map of pixels by a prior that is taken from all of them
+leave-one-out         each capture is judged by a fit to the others
+optimism              how much smaller the squares are in the captures of a fit than in captures that are left out
+effective parameters  half of the optimism: so many free numbers would fit as much of the noise
+evidence              twice the log-likelihood ratio of two models, less two for each effective parameter
+confused              the verdict where another explanation is as good
+mimic                 what no effect describes, and leaves the trace of one
+experiment design     which further capture would separate two explanations
+upper limit           the largest strength that the data allow, at 95 %, of an effect that was not found
+ladder                a row for each model from the given one to the found one: held-out misfit and physical errors
+placebo               a row of the ladder: an unrelated effect at its best strength
 """
 
 import sys

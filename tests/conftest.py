@@ -7,7 +7,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-import tinylab
+from labs import Lab, labs
 
 from spadmnist import plugins
 
@@ -30,5 +30,5 @@ def no_plugins_of_other_tests() -> Iterator[None]:
 
 
 @pytest.fixture
-def lab(tmp_path: Path) -> tinylab.Lab:
-    return tinylab.labs(tmp_path)
+def lab(tmp_path: Path) -> Lab:
+    return labs(tmp_path)

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labs import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 from scipy import stats
-from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 
 from spadmnist.inference import conclusion
 from spadmnist.inference.alternatives import alternatives

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from tinylab import bench_of, labs
+from labs import bench_of, labs
 
 import spadmnist as sp
 from spadmnist.inference.conclusion import Notes, left_over

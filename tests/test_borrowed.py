@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, DURATION, bench_of, given, labs, taken
+from labs import CROSSTALK, DURATION, bench_of, given, labs, taken
 
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.evidence import evaluation_of

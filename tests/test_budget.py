@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tinylab
+from labs import labs
 
 from spadmnist import twin
 from spadmnist.cli import comparing
@@ -36,7 +36,7 @@ AFTERPULSING = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n"
 
 @pytest.fixture
 def lab(tmp_path):
-    return tinylab.labs(tmp_path)
+    return labs(tmp_path)
 
 
 @pytest.fixture

@@ -465,7 +465,7 @@ def test_seals_detect_every_change(made: Path, capsys: pytest.CaptureFixture[str
     assert challenge.main(["score", str(made)]) == 0
     table = (made / "score.md").read_text()
     assert "0 of 8 cases, those asked so far" in table and "## No answer: 0" in table
-    assert "| nulls: false alarm (any verdict but adequate) | 0 of 0 | - | - |  | <= 1 % | 0 |" in table
+    assert "| nulls: false alarm (any verdict but adequate) | 0 of 0 | - | - |  | <= 1 % | 2 of 40 | few | 0 |" in table
 
 
 def truth_of(kind: str, name: str = "x", **more: Any) -> dict[str, Any]:
@@ -582,14 +582,15 @@ def test_the_table_counts_everything() -> None:
     text = scores.report(cases)
     for line in (
         "25 cases.",
-        "| nulls: false alarm (any verdict but adequate) | 1 of 20 | 5 % | 1-24 % |  | <= 1 % | 0 |",
-        "| nulls: false alarm of `compare` | 1 of 20 | 5 % | 1-24 % |  | 1 % | 0 |",
-        "| single, Z >= 10: detected | 1 of 1 | 100 % | 21-100 % |  | >= 98 % | 0 |",
-        "| single, Z 6-10: right effect first | 0 of 1 | 0 % | 0-79 % | 100 % | >= 92 % | 0 |",
-        "| single, Z 4-6: right effect first | 0 of 1 | 0 % | 0-79 % | 95 % | >= 75 % | 1 |",
-        "| single, Z below 3: detected | 0 of 1 | 0 % | 0-79 % |  | <= 20 % | 0 |",
-        "| outside the catalogue: confidently wrong | 1 of 1 | 100 % | 21-100 % |  | <= 1 % | 0 |",
-        "| 95 % intervals that cover the truth, by the catalogue's law | 1 of 1 | 100 % | 21-100 % |  | 93-97 % | 0 |",
+        "| nulls: false alarm (any verdict but adequate) | 1 of 20 | 5 % | 1-24 % |  | <= 1 % | 2 of 40 | few | 0 |",
+        "| nulls: false alarm of `compare` | 1 of 20 | 5 % | 1-24 % |  | <= 1 % | 4 of 200 | few | 0 |",
+        "| single, Z >= 10: detected | 1 of 1 | 100 % | 21-100 % |  | >= 98 % |  | few | 0 |",
+        "| single, Z 6-10: right effect first | 0 of 1 | 0 % | 0-79 % | 100 % | >= 92 % | 82 % | few | 0 |",
+        "| single, Z 4-6: right effect first | 0 of 1 | 0 % | 0-79 % | 95 % | >= 75 % | 60 % | few | 1 |",
+        "| single, Z below 3: detected | 0 of 1 | 0 % | 0-79 % |  | <= 20 % |  | few | 0 |",
+        "| outside the catalogue: confidently wrong | 1 of 1 | 100 % | 21-100 % |  | <= 1 % |  | few | 0 |",
+        "| cases without an answer | 1 of 25 | 4 % | 1-20 % |  | 0 |  | no | 1 |",
+        "| 95 % intervals that cover the truth, by the catalogue's law | 1 of 1 | 100 % | 21-100 % |  | 93-97 % |  |",
         "## Confident wrong answers: 3",
         "- null-x null-x (Z 0.0): explained, per_pixel detection.pdp; true: (null)",
         "## No answer: 1",
@@ -610,12 +611,69 @@ def test_several_hidden_effects_are_counted_one_by_one() -> None:
     ]
     text = scores.report(cases)
     for line in (
-        "| triple: all found | 1 of 2 | 50 % | 9-91 % | 100 % | >= 80 % | 0 |",
-        "| camera: share of what is hidden that is found | 3 of 6 | 50 % | 19-81 % |  | >= 85 % | 0 |",
-        "| steps that are not hidden, of all steps added | 2 of 10 | 20 % | 6-51 % |  | <= 3 % | 0 |",
-        "| unfinished within the budget | 1 of 2 | 50 % | 9-91 % |  | <= 3 % | 0 |",
+        "| triple: all found | 1 of 2 | 50 % | 9-91 % | 100 % | >= 80 % |  | few | 0 |",
+        "| camera: share of what is hidden that is found | 3 of 6 | 50 % | 19-81 % |  | >= 85 % |  | few | 0 |",
+        "| steps that are not hidden, of all steps added | 2 of 10 | 20 % | 6-51 % |  | <= 3 % |  | few | 0 |",
+        "| unfinished within the budget | 1 of 2 | 50 % | 9-91 % |  | <= 3 % |  | few | 0 |",
     ):
         assert line in text, text
+
+
+@pytest.mark.parametrize(
+    ("what", "successes", "trials", "goal", "least", "reached"),
+    [
+        # 92 of 100: the interval ends at 95.9 %; 93 of 95 at 99.4 %
+        ("single, Z >= 10: right effect first", 92, 100, ">= 98 %", "92 %", "no"),
+        ("single, Z >= 10: right effect first", 93, 95, ">= 98 %", "92 %", "yes"),
+        ("single, Z >= 10: right effect first", 300, 300, ">= 98 %", "92 %", "yes"),
+        # that of 23 of 25 ends at 97.8 %
+        ("single, Z >= 10: right effect first", 23, 25, ">= 98 %", "92 %", "no"),
+        ("single, Z >= 10: right effect first", 24, 25, ">= 98 %", "92 %", "yes"),
+        # the interval contains the goal, the share is below the least
+        ("single, Z 6-10: right effect first", 17, 21, ">= 92 %", "82 %", "no"),
+        ("single, Z 6-10: right effect first", 18, 21, ">= 92 %", "82 %", "yes"),
+        ("single, Z 4-6: right effect first", 14, 24, ">= 75 %", "60 %", "no"),
+        ("single, Z 4-6: right effect first", 15, 25, ">= 75 %", "60 %", "yes"),
+        ("outside the catalogue: flagged as unexplained", 33, 40, ">= 95 %", "85 %", "no"),
+        ("outside the catalogue: flagged as unexplained", 36, 40, ">= 95 %", "85 %", "yes"),
+        # false alarms are counted
+        ("nulls: false alarm of `compare`", 4, 200, "<= 1 %", "4 of 200", "yes"),
+        ("nulls: false alarm of `compare`", 5, 200, "<= 1 %", "4 of 200", "no"),
+        ("nulls: false alarm of `compare`", 4, 199, "<= 1 %", "4 of 200", "few"),
+        ("nulls: false alarm of `compare`", 5, 60, "<= 1 %", "4 of 200", "no"),  # the others cannot mend it
+        ("nulls: false alarm (any verdict but adequate)", 2, 40, "<= 1 %", "2 of 40", "yes"),
+        ("nulls: false alarm (any verdict but adequate)", 3, 40, "<= 1 %", "2 of 40", "no"),
+        # too many intervals cover as too few do
+        ("95 % intervals that cover the truth, by the catalogue's law", 380, 400, "93-97 %", "", "yes"),
+        ("95 % intervals that cover the truth, by the catalogue's law", 350, 400, "93-97 %", "", "no"),
+        ("95 % intervals that cover the truth, by the catalogue's law", 399, 400, "93-97 %", "", "no"),
+        ("95 % intervals that cover the truth, by the catalogue's law", 379, 399, "93-97 %", "", "few"),
+        ("outside the catalogue: confidently wrong", 0, 60, "<= 1 %", "", "yes"),
+        ("outside the catalogue: confidently wrong", 3, 60, "<= 1 %", "", "no"),
+        ("double: both found", 19, 25, ">= 92 %", "", "no"),
+        ("triple: all found", 14, 20, ">= 80 %", "", "yes"),
+        ("camera: share of what is hidden that is found", 70, 100, ">= 85 %", "", "no"),
+        ("steps that are not hidden, of all steps added", 3, 200, "<= 3 %", "", "yes"),
+        ("steps that are not hidden, of all steps added", 20, 200, "<= 3 %", "", "no"),
+        ("unfinished within the budget", 20, 200, "<= 3 %", "", "no"),
+        ("cases without an answer", 0, 200, "0", "", "yes"),
+        ("cases without an answer", 1, 200, "0", "", "no"),
+    ],
+)
+def test_goals(what: str, successes: int, trials: int, goal: str, least: str, reached: str) -> None:
+    found = scores.GOALS[what]
+    assert (*found.cells, found.reached(successes, trials)) == (goal, least, reached)
+
+
+def test_of_no_case_nothing_is_reached() -> None:
+    assert {goal.reached(0, 0) for goal in scores.GOALS.values()} == {"few"}
+
+
+def test_every_goal_is_that_of_a_line() -> None:
+    text = scores.report([judge(truth_of("null", z=[]), answer("adequate", finished=True))])
+    for what, goal in scores.GOALS.items():
+        (line,) = (line for line in text.splitlines() if line.startswith(f"| {what} |"))
+        assert line.split(" | ")[-4:-1] == [*(cell for cell in goal.cells), "few"], line
 
 
 def test_wilson() -> None:

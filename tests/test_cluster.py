@@ -18,8 +18,8 @@ from typing import Any
 
 import psutil
 import pytest
-import tinylab
 from commands import run
+from labs import labs
 from test_factory import METHODS, assert_same, assert_sentence, descendants, make, tree, wait_for, write_config
 
 from spadmnist import config, factory, golden, plugins, verify
@@ -199,7 +199,7 @@ def test_plug_ins_and_maps_are_carried_along(cluster: Cluster, tmp_path: Path) -
 
 
 def test_a_comparison_on_a_cluster_is_the_same(cluster: Cluster, tmp_path: Path) -> None:
-    sensor, data = tinylab.labs(tmp_path)()
+    sensor, data = labs(tmp_path)()
     alone, there = (canonical(compare(sensor, data, jobs=workers, replicates=16)) for workers in (1, cluster))
     assert alone == there
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from labs import bench_of, labs
 from scipy import stats
-from tinylab import bench_of, labs
 
 from spadmnist.inference.evaluation import block_checks, evaluate
 from spadmnist.inference.null_distribution import Null, learn

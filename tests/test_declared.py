@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from labs import bench_of, change_of, quiet
 from scipy import stats
-from tinylab import bench_of, change_of, quiet
 
 from spadmnist import measurement, plugins, twin
 from spadmnist.effects import Conditions, Effect, parameter

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from tinylab import bench_of, taken, wrong_numbers
+from labs import bench_of, taken, wrong_numbers
 
 import spadmnist as sp
 from spadmnist.inference.candidates import candidates

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-import tinylab
+from labs import labs
 from test_factory import alive, descendants, wait_for, workers, write_config
 
 from spadmnist import disk
@@ -129,7 +129,7 @@ def begun(command: str, tmp_path: Path) -> psutil.Popen:
     if command == "generate":
         return started("generate", write_config(tmp_path / "c.yaml"), "-o", tmp_path / "out", "--jobs", 2)
     (tmp_path / "labs").mkdir()
-    tinylab.labs(tmp_path / "labs")(dead=80)
+    labs(tmp_path / "labs")(dead=80)
     place = tmp_path / "labs" / "0"
     more = ["-o", tmp_path / "report"] if command == "diagnose" else []
     env = {**os.environ, "SPADMNIST_CACHE": str(tmp_path / "cache")}  # with nulls that are kept no worker would start

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, bench_of, change_of, names, taken
+from labs import CROSSTALK, bench_of, change_of, names, taken
 
 from spadmnist.inference.candidates import with_values
 from spadmnist.inference.elimination import drop_needless

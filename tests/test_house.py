@@ -338,6 +338,14 @@ def test_the_inference_is_tested_by_its_public_names(path: Path) -> None:
             assert not re.fullmatch(r"spadmnist\.inference[\w.]*\._[a-z]\w*", node.value), f"{path.name}:{node.lineno}"
 
 
+def test_the_contents_of_the_inference_are_its_modules() -> None:
+    contents = ast.get_docstring(parsed("inference/__init__.py")) or ""
+    named = [name for names in re.findall(r"^([a-z_, ]+?)  +\S", contents, re.MULTILINE) for name in names.split(", ")]
+    assert len(named) > 40 and len(set(named)) == len(named), named
+    missing = [name for name in named if f"inference/{name}.py" not in MODULES]
+    assert not missing, f"inference/__init__.py names {missing}, which are no modules"
+
+
 @pytest.mark.parametrize("file", sorted(f for f in MODULES if f.startswith("inference/")))
 def test_the_search_asks_for_no_unit_and_no_stage(file: str) -> None:
     """What is special is declared: the kind of a parameter, what an effect acts on, what a likelihood describes."""

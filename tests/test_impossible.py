@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import pytest
-from tinylab import bench_of
+from labs import bench_of
 
 from spadmnist import pages
 from spadmnist.errors import SpadError

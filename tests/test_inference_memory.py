@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import DURATION, bench_of, labs
+from labs import DURATION, bench_of, labs
 
 from spadmnist import twin
 from spadmnist.effects import Conditions

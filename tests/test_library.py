@@ -15,6 +15,11 @@ import spadmnist as sp
 from spadmnist import config, sensor_file, twin
 from spadmnist import measurement as measurements
 from spadmnist.errors import InputError, SpadError
+from spadmnist.inference import results
+from spadmnist.inference.candidates import Candidate
+from spadmnist.inference.comparison import Check, headline
+from spadmnist.inference.results import Value
+from spadmnist.library import answers
 from spadmnist.plugins import ByWavelength, Distribution
 
 LIGHT = {"wavelength": 500e-9, "irradiance": 1e-4}  # W/m^2
@@ -291,6 +296,39 @@ def test_a_comparison_shows_itself(asked: tuple[Any, Any], tmp_path: Path, monke
         gof.to_frame()
     with pytest.raises(InputError, match="tolerance is 5"):
         sp.compare(*asked, tolerance=5)
+
+
+def compared() -> answers.Comparison:
+    """A model that fails one of two checks."""
+    checks = (
+        Check("rows", "dark", 1.1, 0.4, "row 2", "0.1 % of detections", 0.001),
+        Check("neighbours", "flat", 70.0, 1e-9, "1 to 2 ns", "0.5 % of detections", 0.005, passes=False),
+    )
+    return answers.Comparison("one", "lab", "fails", 8.4321, 1.2, (), checks, 100)
+
+
+def test_a_comparison_in_a_notebook_names_the_worst_check() -> None:
+    gof = compared()
+    said = "1 to 2 ns, in flat: 0.5 % of detections (neighbours, p = 1e-09, fails)"
+    assert f"<p>one against lab: fails, misfit 8.432; worst check: {said}</p>" in gof._repr_html_()
+    assert said in " ".join(repr(gof).split())
+
+
+@pytest.mark.parametrize("kind", [answers.Diagnosis, answers.Fit])
+def test_an_answer_in_a_notebook_tells_the_misfits_apart(kind: type[Any]) -> None:
+    """What was held out is a column, what is in sample stands in the title, in the words of the terminal."""
+    step = results.Step(
+        Candidate("add", "crosstalk", None, ()), {"probability": Value(0.005, 0.004, 0.006)}, 11.2, 35.2, ""
+    )
+    lists: list[Any] = [[], [step], [], [], [], [], []]
+    found = results.Diagnosis("one", "lab", "explained", 61.0, 11.2, 1.2, *lists, in_sample=compared())
+    text = kind(found, sensor())._repr_html_()
+    assert "<th>sigma</th><th>held-out misfit</th>" in text and "<td>35.2</td><td>11.2</td>" in text
+    line = f"In sample, misfit 8.432; worst check: {headline(compared())}."
+    assert f"{line}</p>" in text and "0.5 % of detections" in line
+    assert line in " ".join(results.table(found).split())
+    found.in_sample = None
+    assert "sample" not in kind(found, sensor())._repr_html_()
 
 
 def test_a_fit_has_values_intervals_and_covariance(asked: tuple[Any, Any], tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from labs import bench_of
 from numba.core.registry import CPUDispatcher
 from scipy import special, stats
-from tinylab import bench_of
 
 import spadmnist.statistics as statistics
 from spadmnist.events import Events

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, labs, names, quiet, taken
+from labs import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, labs, names, quiet, taken
 
 from spadmnist.inference.candidates import candidates
 from spadmnist.inference.conclusion import Notes

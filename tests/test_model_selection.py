@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
+from labs import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
 from spadmnist.inference.alternatives import alternatives
 from spadmnist.inference.conclusion import Notes

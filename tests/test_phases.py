@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from tinylab import bench_of, change_of
+from labs import bench_of, change_of
 
 from spadmnist.inference.candidates import with_values
 from spadmnist.inference.evaluation import evaluate, square

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tinylab import bench_of, change_of, quiet
+from labs import bench_of, change_of, quiet
 
 import spadmnist
 from spadmnist import config, measurement, twin

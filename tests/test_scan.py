@@ -10,8 +10,8 @@ from typing import Any
 import laws
 import numpy as np
 import pytest
+from labs import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, quiet, taken, wrong_numbers
 from scipy import stats
-from tinylab import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, quiet, taken, wrong_numbers
 
 import spadmnist as sp
 from spadmnist import plugins

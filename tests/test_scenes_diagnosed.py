@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import bench_of, quiet
+from labs import bench_of, quiet
 
 from spadmnist import measurement, twin
 from spadmnist.digits import draw_digit

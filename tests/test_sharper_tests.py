@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from tinylab import LIFETIME, PROBABILITY, bench_of, change_of, labs, quiet
+from labs import LIFETIME, PROBABILITY, bench_of, change_of, labs, quiet
 
 from spadmnist.inference.evaluation import Evaluation, evaluate, stacked
 from spadmnist.inference.map_fits import width_of_most

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from tinylab import bench_of
+from labs import bench_of
 
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.laws import Poisson

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tinylab import Lab
+from labs import Lab
 
 import spadmnist as sp
 from spadmnist import plugins

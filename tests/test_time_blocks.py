@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from labs import CROSSTALK, Lab, bench_of, change_of, labs, taken
 from test_maps_of_pixels import CAPTURES, SENSOR, SIDE
-from tinylab import CROSSTALK, Lab, bench_of, change_of, labs, taken
 
 from spadmnist import config, recording, twin
 from spadmnist import measurement as measurements

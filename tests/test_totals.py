@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labs import bench_of
 from scipy import stats
-from tinylab import bench_of
 
 import spadmnist as sp
 from spadmnist.effects import Conditions

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tinylab import CROSSTALK, DURATION, bench_of, change_of, given, quiet
+from labs import CROSSTALK, DURATION, bench_of, change_of, given, quiet
 
 from spadmnist.inference.candidates import candidates, templates, with_values
 from spadmnist.inference.elimination import drop_needless

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-import tinylab
 from commands import COMMAND
+from labs import labs
 from test_factory import alive, descendants, wait_for
 
 from spadmnist import leftovers
@@ -61,7 +61,7 @@ class Watched:
 
     def __init__(self, folder: Path):
         self.folder, self.log = folder, folder / "log"
-        tinylab.labs(folder)()
+        labs(folder)()
         (self.lab,) = (path.parent for path in folder.glob("*/sensor.yaml"))
         self.compare = ["compare", str(self.lab / "sensor.yaml"), str(self.lab / "lab"), "--jobs", "2"]
         self.watch = folder / "watch"

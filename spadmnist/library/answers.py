@@ -179,6 +179,7 @@ class Comparison(comparison.Comparison):
             for c in sorted(self.checks, key=lambda c: (c.passes, c.p_value))[:_SHOWN]
         ]
         title = f"{self.sensor} against {self.measurement}: {self.verdict}, misfit {self.misfit:.4g}"
+        title += f"; worst check: {comparison.headline(self)}"
         return html_table(title, ("statistic", "capture", "p", "misfit", "", "where", "size"), rows)
 
 
@@ -377,7 +378,10 @@ class _Found:
             for name, v in (s.values.items() or [("", Value(1.0, None, None))])
         ]
         title = f"{self.verdict.replace('_', ' ')}: {results.sentence(self.found)}"
-        return html_table(title, ("step", "parameter", "value (95 %)", "sigma", "misfit"), rows)
+        whole = self.found.in_sample
+        if whole is not None:
+            title += f" In sample, misfit {whole.misfit:.3f}; worst check: {comparison.headline(whole)}."
+        return html_table(title, ("step", "parameter", "value (95 %)", "sigma", "held-out misfit"), rows)
 
 
 class Diagnosis(_Found):
