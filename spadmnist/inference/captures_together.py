@@ -107,7 +107,7 @@ def _alike(evaluation: Evaluation, host: Cell, cells: Sequence[Cell], residuals:
     most = float(z[worst])
     order = sorted(cells, key=lambda cell: -most * float(residuals[cell][worst]))
     beyond = max(most**2, float(z @ z) - z.size)
-    return Together(host, p, worst, most, tuple(order), True, beyond)
+    return Together(cell=host, p=p, worst=worst, z=most, cells=tuple(order), alike=True, excess=beyond)
 
 
 def _law_of_sums(evaluation: Evaluation, cells: Sequence[Cell]) -> Null:
@@ -144,7 +144,15 @@ def _in_squares(
     )
     first = residuals[order[0]]
     worst = int(np.argmax(np.abs(first)))
-    return Together(host, p, worst, float(first[worst]), tuple(order), False, max(square - mean, 0.0))
+    return Together(
+        cell=host,
+        p=p,
+        worst=worst,
+        z=float(first[worst]),
+        cells=tuple(order),
+        alike=False,
+        excess=max(square - mean, 0.0),
+    )
 
 
 def _moments_of_squares(evaluation: Evaluation, sizes: Mapping[Cell, int]) -> tuple[float, float]:

@@ -190,10 +190,14 @@ def rival_step(path: ModelPath, rival: Trial) -> Step:
     """A change of the sensor that explains the totals as well as the set-up does, as a step."""
     coordinate = rival.candidate.strengths[0]
     low, high = rival.intervals.get(coordinate.key, (None, None))
-    value = Value(float(rival.values[coordinate.key]), low, high, coordinate.unit)
+    value = Value(value=float(rival.values[coordinate.key]), low=low, high=high, unit=coordinate.unit)
     left = mean_misfit(path.evaluation.replicate_residuals, rival.residuals or path.evaluation.residuals)
     return Step(
-        rival.candidate, {coordinate.parameter: value}, left, math.sqrt(max(rival.fall, 0.0)), "all rates alike"
+        candidate=rival.candidate,
+        values={coordinate.parameter: value},
+        misfit=left,
+        significance=math.sqrt(max(rival.fall, 0.0)),
+        material="all rates alike",
     )
 
 

@@ -173,7 +173,18 @@ def _evaluate(
     about, wanted, entries = {}, [], dict[str, str | None]()
     before = {id: made for id, made in known.made.items() if id not in known.borrowed} if known else {}
     same = _same_level(replicates, sensors, n, *near) if near else {}
-    evaluation = Evaluation(dict(values), sensors, {}, {}, {}, {}, {}, {}, {}, borrowed=frozenset(same))
+    evaluation = Evaluation(
+        values=dict(values),
+        sensors=sensors,
+        made={},
+        nulls={},
+        rates={},
+        factors={},
+        residuals={},
+        replicate_residuals={},
+        judgements={},
+        borrowed=frozenset(same),
+    )
     centres = _centres(replicates, sensors, same)
     for id, seen in replicates.seen.items():
         if seen.counts is None:
@@ -210,7 +221,9 @@ def _evaluate(
         evaluation.made[id] = made
         law, scatter = law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
         most = most_detections(replicates.seen[id].counted, sensors.one.layout.pixels)
-        evaluation.rates[id] = CaptureNull(centre, stated, made.totals, expected, law, scatter, most)
+        evaluation.rates[id] = CaptureNull(
+            level=centre, stated=stated, totals=made.totals, expected=expected, law=law, scatter=scatter, most=most
+        )
         evaluation.factors[id] = factors
         for name, summary in replicates.seen[id].summaries.items():
             if name not in made.values:
@@ -461,7 +474,8 @@ def block_checks(
     for cell, z in residuals.items():
         if cell == TOTALS:
             out += [
-                BlockCheck(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)
+                BlockCheck(cell=("", f"rate {k}"), p=float(2 * stats.norm.sf(abs(v))), worst=k, z=float(v))
+                for k, v in enumerate(z)
             ]
         else:
             alone[cell] = evaluation.nulls[cell].p_value(z)
@@ -472,10 +486,10 @@ def block_checks(
         here = several.get(cell, [])
         least, tests = min(here, key=lambda check: check.p, default=None), 1 + len(here)
         if least is not None and least.p < p:
-            out.append(BlockCheck(cell, least.p, least.worst, least.z, tests, least))
+            out.append(BlockCheck(cell=cell, p=least.p, worst=least.worst, z=least.z, tests=tests, together=least))
         else:
-            out.append(BlockCheck(cell, p, worst, float(residuals[cell][worst]), tests))
-    out += [BlockCheck(cell, 1e-12, 0, 40.0) for cell in evaluation.exact]
+            out.append(BlockCheck(cell=cell, p=p, worst=worst, z=float(residuals[cell][worst]), tests=tests))
+    out += [BlockCheck(cell=cell, p=1e-12, worst=0, z=40.0) for cell in evaluation.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))
 
 

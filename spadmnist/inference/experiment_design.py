@@ -127,7 +127,9 @@ def expected_significance(
 
     def there(sensors: Model) -> Model:
         typical = (lambda id: sensors.mean_sensor(like)) if sensors.typical else None
-        return Model(lambda id, number: sensors.of(like, number), sensors.one, sensors.alike, typical)
+        return Model(
+            of=lambda id, number: sensors.of(like, number), one=sensors.one, alike=sensors.alike, typical=typical
+        )
 
     first, second = there(known.sensors), there(other)
     stated = twin.photons_at(capture, replicates.start.layout)

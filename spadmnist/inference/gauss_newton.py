@@ -185,13 +185,13 @@ def gauss_newton(
     assert best is not None
     cost, u, z = best
     return Fit(
-        coordinates,
-        u,
-        covariance_of(jacobian, own),
-        _split(z, evaluation, keys),
-        _split(jacobian, evaluation, keys),
-        cost,
-        at(u),
+        coordinates=coordinates,
+        point=u,
+        covariance=covariance_of(jacobian, own),
+        residuals=_split(z, evaluation, keys),
+        jacobian=_split(jacobian, evaluation, keys),
+        square=cost,
+        values=at(u),
     )
 
 
@@ -298,13 +298,13 @@ def gauss_newton_step(
     left = z + jacobian @ (point - u)
     new = {**values, **{d.key: d.value(float(x)) for d, x in zip(coordinates, point, strict=True)}}
     return Fit(
-        coordinates,
-        point,
-        covariance,
-        _split(left, evaluation, keys),
-        _split(jacobian, evaluation, keys),
-        float(left @ left),
-        new,
+        coordinates=coordinates,
+        point=point,
+        covariance=covariance,
+        residuals=_split(left, evaluation, keys),
+        jacobian=_split(jacobian, evaluation, keys),
+        square=float(left @ left),
+        values=new,
     )
 
 

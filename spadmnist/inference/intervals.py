@@ -63,7 +63,9 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
                 abs(coordinate.coordinate(value) - coordinate.coordinate(start[coordinate.key]))
                 / errors[coordinate.key],
             )
-            step.values[coordinate.parameter] = Value(value, low, high, coordinate.unit, "likelihood")
+            step.values[coordinate.parameter] = Value(
+                value=value, low=low, high=high, unit=coordinate.unit, method="likelihood"
+            )
             path.values[coordinate.key] = value
     if largest_move > _MOVED:
         path.evaluation = evaluate(replicates, path.values, model_of(path)[0])

@@ -155,7 +155,15 @@ def _side_by_side(evaluation: Evaluation, coordinates: tuple[Coordinate, ...], f
         columns.append(column_of(fit, fit.coordinates.index(coordinate), evaluation))
     jacobian = {cell: np.stack([column[cell] for column in columns], axis=1) for cell in evaluation.residuals}
     n = len(coordinates)
-    return Fit(coordinates, np.zeros(n), np.full((n, n), np.inf), {}, jacobian, math.inf, {})
+    return Fit(
+        coordinates=coordinates,
+        point=np.zeros(n),
+        covariance=np.full((n, n), np.inf),
+        residuals={},
+        jacobian=jacobian,
+        square=math.inf,
+        values={},
+    )
 
 
 def repeated_steps(
@@ -187,7 +195,7 @@ def repeated_steps(
         here = {d.key: path.values[d.key] for d in coordinates}
         try:
             only = functools.partial(_shown, path) if where_shown else lambda key: ()
-            by = JacobianBy(_recordings(evaluation), errors, known, near, only)
+            by = JacobianBy(few=_recordings(evaluation), errors=errors, known=known, before=near, only=only)
             model = functools.partial(path.model_at, evaluation)
             closer = gauss_newton_step(replicates, evaluation, coordinates, here, model, by)
         except CannotSimulate as error:
@@ -338,7 +346,7 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
                 # the interval for any value of a whole number; it is of no use where later steps have moved the value
                 inside = low <= own.value <= high
                 low, high = (min(low, own.low), max(high, own.high)) if inside else (own.low, own.high)
-            step.values[name] = Value(float(path.values[effect, name]), low, high, unit)
+            step.values[name] = Value(value=float(path.values[effect, name]), low=low, high=high, unit=unit)
         for (_, name), value in step.candidate.fixed:
             if name not in step.values and isinstance(value, (bool, int, float)):
                 step.values[name] = Value(float(value), None, None)

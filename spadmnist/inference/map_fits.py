@@ -485,7 +485,16 @@ def fit_codes(replicates: Replicates, candidate: Candidate, use: Sequence[str] =
         logs = np.log(np.maximum(1 + raw * share, 1e-3))
         error = np.full(period, math.sqrt(noise * share))
         spread = np.full(period, math.sqrt(noise))
-        found = PixelMap(candidate.carrier, 1.0, np.arange(period), logs, error, np.log1p(raw), spread, sigma)
+        found = PixelMap(
+            carrier=candidate.carrier,
+            base=1.0,
+            group=np.arange(period),
+            estimate=logs,
+            error=error,
+            raw=np.log1p(raw),
+            raw_error=spread,
+            sigma=sigma,
+        )
     if found is None:
         raise SpadError("no capture has stamps with codes")
     return found
@@ -517,6 +526,13 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
     raw, raw_error = mean_of(likely, grid)
     low, high = bounds_of(candidate.carrier)
     map_ = PixelMap(
-        candidate.carrier, base, groups_of(start, candidate.per), estimate, error, raw, raw_error, width.sigma
+        carrier=candidate.carrier,
+        base=base,
+        group=groups_of(start, candidate.per),
+        estimate=estimate,
+        error=error,
+        raw=raw,
+        raw_error=raw_error,
+        sigma=width.sigma,
     )
     return replace(map_, low=low, high=high, likely=(grid, weights), certain=0.0, width=width)

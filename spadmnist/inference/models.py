@@ -54,10 +54,10 @@ class Model:
         """
         typical = self.typical
         return Model(
-            lambda capture, number: self.of(name_of(capture), number),
-            self.one,
-            self.alike,
-            None if typical is None else lambda capture: typical(name_of(capture)),
+            of=lambda capture, number: self.of(name_of(capture), number),
+            one=self.one,
+            alike=self.alike,
+            typical=None if typical is None else lambda capture: typical(name_of(capture)),
         )
 
     def changed(
@@ -96,7 +96,7 @@ class Model:
 
         alike = self.alike and not chips
         typical = functools.lru_cache(maxsize=64)(usual) if self.typical or chips else None
-        return Model(of, changed(self.one, {}), alike, typical)
+        return Model(of=of, one=changed(self.one, {}), alike=alike, typical=typical)
 
 
 def phase_parameters(sensor: Sensor) -> list[Key]:

@@ -106,11 +106,20 @@ class Null:
             wrong = values != expected
             worst = int(np.argmax(wrong))
             p = 1e-12 if wrong.any() else 1.0
-            return Judgement(p, float(wrong.any()) * 1e3, np.where(wrong, 40.0, 0.0), expected, spread, worst)
+            return Judgement(
+                p_value=p,
+                misfit=float(wrong.any()) * 1e3,
+                residuals=np.where(wrong, 40.0, 0.0),
+                expected=expected,
+                spread=spread,
+                worst=worst,
+            )
         z = self.residuals(values, expected, leverage)
         p, worst = self.p_value(z)
         mean = max(float(self.own.mean()), 0.05)
-        return Judgement(p, float(np.mean(z**2)) / mean, z, expected, spread, worst)
+        return Judgement(
+            p_value=p, misfit=float(np.mean(z**2)) / mean, residuals=z, expected=expected, spread=spread, worst=worst
+        )
 
     def p_value(self, z: np.ndarray) -> tuple[float, int]:
         """(p-value of residuals, the cell of the largest one).
@@ -178,7 +187,17 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
         law = law_of("poisson", False)  # of this model it is a rare event: its light goes out, its frames repeat
     if law.exact:
         coefficients = np.median(values, axis=0, keepdims=True)
-        return Null(law, middle, coefficients, np.ones((1, 1)), np.zeros(values.shape[1]), n, 1.0, 1.0, np.zeros(n))
+        return Null(
+            law=law,
+            middle=middle,
+            coefficients=coefficients,
+            inverse=np.ones((1, 1)),
+            spread=np.zeros(values.shape[1]),
+            recordings=n,
+            factor=1.0,
+            tail=1.0,
+            own=np.zeros(n),
+        )
     follows = law.terms > 1 and bool(np.ptp(x) > 0)
     design = _terms(x, law.terms if follows else 1)
     inverse = np.linalg.pinv(design.T @ design)
@@ -197,7 +216,19 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
     own, known = np.mean(z**2, axis=1), None if contrasts is None else in_scatters(contrasts, z)
-    return Null(law, middle, coefficients, inverse, spread, n, factor, tail_of(z), own, reach, known)
+    return Null(
+        law=law,
+        middle=middle,
+        coefficients=coefficients,
+        inverse=inverse,
+        spread=spread,
+        recordings=n,
+        factor=factor,
+        tail=tail_of(z),
+        own=own,
+        reach=reach,
+        contrasts=known,
+    )
 
 
 def in_scatters(contrasts: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -82,7 +82,9 @@ class CaptureReplicates:
     def first(self, number: int) -> CaptureReplicates:
         """The first `number` replicates, or all of them where there are fewer."""
         values = {name: x[:number] for name, x in self.values.items()}
-        return CaptureReplicates(self.numbers[:number], self.totals[:number], values, self.laws)
+        return CaptureReplicates(
+            numbers=self.numbers[:number], totals=self.totals[:number], values=values, laws=self.laws
+        )
 
 
 @dataclass(frozen=True)
@@ -149,10 +151,10 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
         return CannotSimulate.because(error)
     whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
     return CaptureReplicates(
-        numbers,
-        np.array(totals, float),
-        {n: np.stack([one.values for one in s]).astype(np.float64) for n, s in whole.items()},
-        {
+        numbers=numbers,
+        totals=np.array(totals, float),
+        values={n: np.stack([one.values for one in s]).astype(np.float64) for n, s in whole.items()},
+        laws={
             n: (s[0].law, None if s[0].scale is None else np.mean([np.asarray(x.scale) for x in s[:_SCALES]], axis=0))
             for n, s in whole.items()
         },
@@ -212,7 +214,9 @@ class Replicates:
         self._reported: set[int] = set()  # numbers of workers that were reported
         for capture in measurement.captures:
             if capture.mean is not None:
-                self.seen[capture.id] = ReducedCapture(capture, capture.mean * sensor.layout.pixels, None, {})
+                self.seen[capture.id] = ReducedCapture(
+                    capture=capture, total=capture.mean * sensor.layout.pixels, counts=None, summaries={}
+                )
                 continue
             recording = self.recording(capture.id)
             total = float(recording.totals.sum())
@@ -389,10 +393,10 @@ def joined(parts: Sequence[CaptureReplicates]) -> CaptureReplicates:
     """Replicates of one capture together: of the statistics that all of them have."""
     names = [name for name in parts[0].values if all(name in part.values for part in parts)]
     return CaptureReplicates(
-        np.concatenate([p.numbers for p in parts]),
-        np.concatenate([p.totals for p in parts]),
-        {name: np.concatenate([p.values[name] for p in parts]) for name in names},
-        {name: parts[0].laws[name] for name in names},
+        numbers=np.concatenate([p.numbers for p in parts]),
+        totals=np.concatenate([p.totals for p in parts]),
+        values={name: np.concatenate([p.values[name] for p in parts]) for name in names},
+        laws={name: parts[0].laws[name] for name in names},
     )
 
 

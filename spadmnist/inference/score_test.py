@@ -276,7 +276,7 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
     many = len(evaluation.replicate_residuals[TOTALS])
     most = float(many - 1)
     if not keys:
-        return ScoreTest(0.0, 0.0, np.zeros(many), 1.0, most)
+        return ScoreTest(size=0.0, data=0.0, own=np.zeros(many), spread=1.0, freedom=most)
     own = np.zeros(many)
     size = data = norm = fourth = wild = 0.0
     for key in keys:
@@ -298,7 +298,9 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
     # dependent cells may be far out together: the tails are those of few
     few = 2 * norm**4 / max(wild, 1e-300) / spread**2
     freedom = most if spread < _TOGETHER else min(max(few, _FEWEST), most)
-    return ScoreTest(size / norm / spread, data / norm / spread, own / norm / spread, spread, freedom)
+    return ScoreTest(
+        size=size / norm / spread, data=data / norm / spread, own=own / norm / spread, spread=spread, freedom=freedom
+    )
 
 
 def _nearly_normal(replicates: Replicates, evaluation: Evaluation, key: Cell) -> np.ndarray:

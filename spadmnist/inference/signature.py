@@ -62,7 +62,9 @@ class Signature:
         shifts = {cell: x for cell, x in self.shifts.items() if cell[0] in ids}
         noise = {cell: x for cell, x in self.noise.items() if cell[0] in ids}
         even = None if self.even is None else self.even.only(ids)
-        return Signature(shifts, noise, self.logs, self.nothing, even, self.fluctuates)
+        return Signature(
+            shifts=shifts, noise=noise, logs=self.logs, nothing=self.nothing, even=even, fluctuates=self.fluctuates
+        )
 
     def completed(self, other: Signature, ids: Collection[str]) -> Signature:
         """The signature, completed by that of `other` in captures of which this one has the totals alone."""
@@ -73,17 +75,24 @@ class Signature:
             even = (even or Signature({}, {}, {})).completed(there.even or Signature({}, {}, {}), ids)
         shifts, noise = {**self.shifts, **there.shifts}, {**self.noise, **there.noise}
         fluctuates = self.fluctuates or other.fluctuates
-        return Signature(shifts, noise, logs, self.nothing and other.nothing, even, fluctuates)
+        return Signature(
+            shifts=shifts,
+            noise=noise,
+            logs=logs,
+            nothing=self.nothing and other.nothing,
+            even=even,
+            fluctuates=fluctuates,
+        )
 
     def at(self, times: float) -> Signature:
         """The shifts at `times` the strength, as a signature without an even part."""
         if self.even is None and times == 1:
             return self
         out = Signature(
-            {cell: times * x for cell, x in self.shifts.items()},
-            {cell: times**2 * x for cell, x in self.noise.items()},
-            {id: times * x for id, x in self.logs.items()},
-            self.nothing,
+            shifts={cell: times * x for cell, x in self.shifts.items()},
+            noise={cell: times**2 * x for cell, x in self.noise.items()},
+            logs={id: times * x for id, x in self.logs.items()},
+            nothing=self.nothing,
         )
         if self.even is not None:
             for cell, x in self.even.shifts.items():
@@ -118,7 +127,14 @@ class Signature:
             chance = 2 * typical * np.abs(even.shifts[cell]) / few  # variance of the noise that grows in proportion
             odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * chance, odd[cell], 0.0)
         scatters = up.fluctuates or down.fluctuates
-        return Signature(odd, noise, half(up.logs, down.logs, -1.0), up.nothing and down.nothing, even, scatters)
+        return Signature(
+            shifts=odd,
+            noise=noise,
+            logs=half(up.logs, down.logs, -1.0),
+            nothing=up.nothing and down.nothing,
+            even=even,
+            fluctuates=scatters,
+        )
 
 
 def signature_of_totals(replicates: Replicates, evaluation: Evaluation, sensors: Model) -> Signature:
@@ -294,7 +310,7 @@ def signature_from(
                 shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
             if shift.any():
                 shifts[cell], noise[cell] = shift, left
-    return Signature(shifts, noise, logs, nothing, fluctuates=scattered)
+    return Signature(shifts=shifts, noise=noise, logs=logs, nothing=nothing, fluctuates=scattered)
 
 
 def odd_and_even(replicates: Replicates, evaluation: Evaluation, up: Signature, down: Signature, few: int) -> Signature:

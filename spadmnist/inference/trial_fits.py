@@ -216,14 +216,14 @@ def _strengths_anew(one: Trial, found: Fit, fit: Callable[[Mapping[Key, Any], in
     for cell, x in again.jacobian.items():
         jacobian[cell][:, moving] = x
     return Fit(
-        found.coordinates,
-        point_of(found.coordinates, again.values),
-        found.covariance,
-        again.residuals,
-        jacobian,
-        again.square,
-        again.values,
-        found.phases,
+        coordinates=found.coordinates,
+        point=point_of(found.coordinates, again.values),
+        covariance=found.covariance,
+        residuals=again.residuals,
+        jacobian=jacobian,
+        square=again.square,
+        values=again.values,
+        phases=found.phases,
     )
 
 
@@ -291,7 +291,15 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
     }
     own = np.concatenate([evaluation.replicate_residuals[cell] for cell in residuals], axis=1)
     covariance = covariance_of(np.concatenate(list(jacobian.values())), own)
-    one.fit = Fit(coordinates, now, covariance, residuals, jacobian, square(residuals), one.values)
+    one.fit = Fit(
+        coordinates=coordinates,
+        point=now,
+        covariance=covariance,
+        residuals=residuals,
+        jacobian=jacobian,
+        square=square(residuals),
+        values=one.values,
+    )
     return one
 
 
