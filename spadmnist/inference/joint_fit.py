@@ -331,8 +331,9 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
                     continue
                 variance = max(float(fit.covariance[i, i]), 0.0) + extra[k]
                 u, half = float(fit.point[i]), HALF_95 * math.sqrt(variance)
+                low, high = coordinate.interval(u - half, u + half)
                 step.values[coordinate.parameter] = Value(
-                    coordinate.value(u), *coordinate.interval(u - half, u + half), coordinate.unit
+                    value=coordinate.value(u), low=low, high=high, unit=coordinate.unit
                 )
                 path.values[coordinate.key] = coordinate.value(u)
     for step in path.steps:

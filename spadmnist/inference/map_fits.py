@@ -122,13 +122,15 @@ class _Fitted:
         assert candidate.carrier is not None
         declared = Effect.registry.find(candidate.carrier[0]).parameters[candidate.carrier[1]]
         base, group = base_of(start, candidate), groups_of(start, candidate.per)
+        low, high = bounds_of(candidate.carrier)
         size = int(group.max()) + 1
         return cls(
-            candidate,
-            base if base > 0 else float((declared.search or (1e-3, 1))[0]),
-            group,
-            *bounds_of(candidate.carrier),
-            acts_on_light(start, candidate),
+            candidate=candidate,
+            base=base if base > 0 else float((declared.search or (1e-3, 1))[0]),
+            group=group,
+            low=low,
+            high=high,
+            of_light=acts_on_light(start, candidate),
             logs=np.zeros(size),
             variance=np.ones(size),
             raw=np.zeros(size),
@@ -218,9 +220,19 @@ class _Fitted:
     def map(self, of_scene: bool) -> PixelMap:
         """The map as fitted."""
         assert self.candidate.carrier is not None
-        error = np.sqrt(np.maximum(self.variance, 0))
-        own = self.group, self.logs, error, self.raw, np.sqrt(self.raw_variance), self.sigma, self.low, self.high
-        return replace(PixelMap(self.candidate.carrier, self.base, *own), of_scene=of_scene)
+        return PixelMap(
+            carrier=self.candidate.carrier,
+            base=self.base,
+            group=self.group,
+            estimate=self.logs,
+            error=np.sqrt(np.maximum(self.variance, 0)),
+            raw=self.raw,
+            raw_error=np.sqrt(self.raw_variance),
+            sigma=self.sigma,
+            low=self.low,
+            high=self.high,
+            of_scene=of_scene,
+        )
 
 
 def width_of_most(raw: np.ndarray, noise: float) -> float:

@@ -344,9 +344,21 @@ class Replicates:
                 packed = [Packed.of(sensor, self.workers.apart) for sensor in sensors]
                 del sensors  # there may be many, with a map each
                 for part in parts:
-                    models = packed if model.alike else [packed[i] for i in part]
-                    rest = self.seed, self.dead, hasty, some_of[k], second, self.seen[id].early, cells
-                    tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
+                    tasks[k].append(
+                        _Task(
+                            models=packed if model.alike else [packed[i] for i in part],
+                            capture=capture,
+                            photons=photons[part],
+                            numbers=numbers[part],
+                            seed=self.seed,
+                            dead=self.dead,
+                            hasty=hasty,
+                            names=some_of[k],
+                            second=second,
+                            early=self.seen[id].early,
+                            cells=cells,
+                        )
+                    )
             except UNABLE as error:
                 tasks[k], out[k] = [], CannotSimulate.because(error)
         self.budget.spend(sum(work))
