@@ -86,8 +86,8 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
 
     def evaluation(width: float, other: float) -> Any:
         null = {
-            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law(), own=STEADY),
-            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), own=STEADY),
+            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law(), replicate_squares=STEADY),
+            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), replicate_squares=STEADY),
         }
         left = {TREND: z / width, MANY: np.full(1000, other), TOTALS: totals / width}
         return SimpleNamespace(nulls=null, residuals=left, space=([], np.ones(3), np.eye(3) / width, np.zeros(3)))

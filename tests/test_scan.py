@@ -428,7 +428,7 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
 
 def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
     """A thousand cells in which it does nothing happen to lie nearer to it; in the one where it does, data lie away."""
-    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), own=np.ones(32))
+    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), replicate_squares=np.ones(32))
     now, there = (
         SimpleNamespace(
             nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)}, space=None

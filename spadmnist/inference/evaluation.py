@@ -106,7 +106,7 @@ class Evaluation:
             cell: (capture, statistic).
             total: detections of the capture.
         """
-        return self.once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
+        return self.once(("expected", cell, total), lambda: self.nulls[cell].expected(total))
 
     def without_replicates(self) -> Evaluation:
         """The evaluation of a model from which the search has gone on: without its replicates and null distributions.
@@ -229,8 +229,8 @@ def _evaluate(
             if name not in made.values:
                 continue
             kind, scale = made.laws[name]
-            own = [Summary(v, kind, str, no_size, scale) for v in made.values[name]]
-            null = learn(own, made.totals, summary.contrasts)
+            summaries = [Summary(v, kind, str, no_size, scale) for v in made.values[name]]
+            null = learn(summaries, made.totals, summary.contrasts)
             cell = id, name
             evaluation.nulls[cell] = null
             evaluation.judgements[cell] = judged = null.judge(summary.values, replicates.seen[id].total)
@@ -254,9 +254,13 @@ def _compare_totals(replicates: Replicates, evaluation: Evaluation, number: int)
 
 def with_totals_anew(replicates: Replicates, evaluation: Evaluation) -> Evaluation:
     """The evaluation with its totals compared anew, where `Replicates.unstated` has changed."""
-    residuals, own = dict(evaluation.residuals), dict(evaluation.replicate_residuals)
-    again = replace(evaluation, residuals=residuals, replicate_residuals=own, space=None)
-    _compare_totals(replicates, again, len(own[TOTALS]))
+    again = replace(
+        evaluation,
+        residuals=dict(evaluation.residuals),
+        replicate_residuals=dict(evaluation.replicate_residuals),
+        space=None,
+    )
+    _compare_totals(replicates, again, len(again.replicate_residuals[TOTALS]))
     return again
 
 
@@ -378,7 +382,7 @@ def log_likelihood_ratio(evaluation: Evaluation, other: Evaluation, template: Ma
         null, new = evaluation.nulls[cell], other.nulls[cell]
         fall, wider = null.law.likelihood_ratio(z, there, (null.breadth, new.breadth), (null.factor, new.factor))
         wider = np.broadcast_to(wider, z.shape)
-        error = null.law.error_of_scatter(z.size, min(len(null.own), len(new.own)))
+        error = null.law.error_of_scatter(z.size, min(len(null.replicate_squares), len(new.replicate_squares)))
         moved = (template[cell] != 0) & (float(template[cell] @ template[cell]) > _MOVED)
         other_scatter = np.abs(wider) > _OTHER_SCATTER * error
         # a cell that never varies has no scatter: the log of its ratio is bounded
@@ -399,39 +403,39 @@ def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarr
     return np.concatenate([blocks[k] for k in keys]) if keys else np.zeros(0)
 
 
-def misfits(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
+def misfits(replicate_residuals: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
     """The mean squared residual of each block, relative to that of the model's replicates.
 
     Args:
-        own: (replicates, cells) residuals of the replicates, by block.
+        replicate_residuals: (replicates, cells) residuals of the replicates, by block.
         residuals: (cells,) by block.
     """
     return {
-        cell: float(np.mean(z**2)) / max(float(np.mean(own[cell] ** 2)), 0.05)
+        cell: float(np.mean(z**2)) / max(float(np.mean(replicate_residuals[cell] ** 2)), 0.05)
         for cell, z in residuals.items()
         if cell != TOTALS and len(z)
     }
 
 
-def mean_misfit(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> float:
+def mean_misfit(replicate_residuals: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> float:
     """The mean misfit over the blocks; where only means were measured, that of the totals.
 
     Args:
-        own, residuals: as in `misfits`.
+        replicate_residuals, residuals: as in `misfits`.
     """
-    all_ = list(misfits(own, residuals).values())
+    all_ = list(misfits(replicate_residuals, residuals).values())
     if not all_ and len(residuals[TOTALS]):
         return float(np.mean(residuals[TOTALS] ** 2))
     return float(np.mean(all_)) if all_ else 1.0
 
 
-def misfit_null_95(own: Mapping[Cell, np.ndarray]) -> float:
+def misfit_null_95(replicate_residuals: Mapping[Cell, np.ndarray]) -> float:
     """The 95 % quantile of the mean misfit under the null.
 
     Args:
-        own: (replicates, cells) residuals of the replicates, by block; the number that all blocks have is used.
+        replicate_residuals: as in `misfits`; the number of replicates that all blocks have is used.
     """
-    squares = [np.mean(z**2, axis=1) for cell, z in own.items() if cell != TOTALS]
+    squares = [np.mean(z**2, axis=1) for cell, z in replicate_residuals.items() if cell != TOTALS]
     if not squares:
         return 1.2
     n = min(map(len, squares))

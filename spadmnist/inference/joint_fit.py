@@ -290,9 +290,9 @@ def rise_of(before: Evaluation, after: Evaluation, keys: Sequence[Cell]) -> tupl
     if not keys:
         return 0.0, 0.0
     rise = square({k: after.residuals[k] for k in keys}) - square({k: before.residuals[k] for k in keys})
-    own = np.concatenate([before.replicate_residuals[k] for k in keys], axis=1)
-    projection = own @ stacked(before.residuals, keys)
-    variance = 1 / len(own) + 1 / len(after.replicate_residuals[keys[0]])
+    replicate_residuals = np.concatenate([before.replicate_residuals[k] for k in keys], axis=1)
+    projection = replicate_residuals @ stacked(before.residuals, keys)
+    variance = 1 / len(replicate_residuals) + 1 / len(after.replicate_residuals[keys[0]])
     return rise, 2 * math.sqrt(variance) * float(np.std(projection))
 
 

@@ -91,12 +91,12 @@ class Model:
                 return changed(sensor, own(capture))
             return with_values(on_chip(sensor, number + 1) if chips else sensor, {**values, **own(capture)})
 
-        def usual(capture: str) -> Sensor:
+        @functools.lru_cache(maxsize=64)
+        def typical(capture: str) -> Sensor:
             return with_values(self.mean_sensor(capture), {**values, **own(capture)})
 
         alike = self.alike and not chips
-        typical = functools.lru_cache(maxsize=64)(usual) if self.typical or chips else None
-        return Model(of=of, one=changed(self.one, {}), alike=alike, typical=typical)
+        return Model(of=of, one=changed(self.one, {}), alike=alike, typical=typical if self.typical or chips else None)
 
 
 def phase_parameters(sensor: Sensor) -> list[Key]:

@@ -63,7 +63,7 @@ class Null:
         recordings: number of replicates.
         factor: the factor by which standardized residuals are too large, from the replicates.
         tail: the same for the largest residuals.
-        own: (replicates,) mean squared residual of each replicate.
+        replicate_squares: (replicates,) mean squared residual of each replicate.
         reach: (least, most) total relative to `middle`, less 1, to which the regression is extrapolated.
         contrasts: (patterns, cells) of the summary, each of unit length, divided by its scatter in the replicates;
             None without any.
@@ -77,7 +77,7 @@ class Null:
     recordings: int
     factor: float
     tail: float
-    own: np.ndarray
+    replicate_squares: np.ndarray
     reach: tuple[float, float] = (-math.inf, math.inf)
     contrasts: np.ndarray | None = None
 
@@ -116,7 +116,7 @@ class Null:
             )
         z = self.residuals(values, expected, leverage)
         p, worst = self.p_value(z)
-        mean = max(float(self.own.mean()), 0.05)
+        mean = max(float(self.replicate_squares.mean()), 0.05)
         return Judgement(
             p_value=p, misfit=float(np.mean(z**2)) / mean, residuals=z, expected=expected, spread=spread, worst=worst
         )
@@ -146,8 +146,8 @@ class Null:
 
     def moments_of_squares(self, cells: int) -> tuple[float, float]:
         """(mean, variance) of the mean squared residual of so many cells."""
-        mean = max(float(self.own.mean()), 0.05)
-        variance = self.law.variance_of_squares(float(self.own.var(ddof=1)), cells)
+        mean = max(float(self.replicate_squares.mean()), 0.05)
+        variance = self.law.variance_of_squares(float(self.replicate_squares.var(ddof=1)), cells)
         return mean, variance * widening(self.recordings)
 
     def residuals(self, values: np.ndarray, expected: np.ndarray, leverage: float | np.ndarray) -> np.ndarray:
@@ -196,7 +196,7 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
             recordings=n,
             factor=1.0,
             tail=1.0,
-            own=np.zeros(n),
+            replicate_squares=np.zeros(n),
         )
     follows = law.terms > 1 and bool(np.ptp(x) > 0)
     design = _terms(x, law.terms if follows else 1)
@@ -215,7 +215,7 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
     z = z / factor
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-    own, known = np.mean(z**2, axis=1), None if contrasts is None else in_scatters(contrasts, z)
+    known = None if contrasts is None else in_scatters(contrasts, z)
     return Null(
         law=law,
         middle=middle,
@@ -225,7 +225,7 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
         recordings=n,
         factor=factor,
         tail=tail_of(z),
-        own=own,
+        replicate_squares=np.mean(z**2, axis=1),
         reach=reach,
         contrasts=known,
     )

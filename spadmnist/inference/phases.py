@@ -223,19 +223,19 @@ def _best(
         around: (phases,) rad to try, by capture.
     """
     ids, _, root, _ = totals_space(replicates, evaluation)
-    own = {cell: x for cell, x in swing.shifts.items() if cell in evaluation.residuals}
-    before = {cell: float(evaluation.residuals[cell] @ evaluation.residuals[cell]) for cell in own}
+    shifts = {cell: x for cell, x in swing.shifts.items() if cell in evaluation.residuals}
+    before = {cell: float(evaluation.residuals[cell] @ evaluation.residuals[cell]) for cell in shifts}
     rates = evaluation.residuals[TOTALS]
     best: tuple[float, float, dict[str, float]] | None = None
     for t in times:
         waves = {id: np.stack([_waves(t, float(p)) for p in phases]) for id, phases in around.items()}
-        gain = {id: np.zeros(len(phases)) for id, phases in around.items()}
-        for cell, x in own.items():
+        falls = {id: np.zeros(len(phases)) for id, phases in around.items()}
+        for cell, x in shifts.items():
             some = max(1, _AT_ONCE // x.shape[1])
             for k in range(0, len(waves[cell[0]]), some):
                 z = residuals_shifted(replicates, evaluation, cell, waves[cell[0]][k : k + some] @ x)
-                gain[cell[0]][k : k + some] += before[cell] - np.einsum("pc,pc->p", z, z)
-        chosen = {id: int(g.argmax()) for id, g in gain.items()}
+                falls[cell[0]][k : k + some] += before[cell] - np.einsum("pc,pc->p", z, z)
+        chosen = {id: int(fall.argmax()) for id, fall in falls.items()}
         logs = {id: waves[id] @ swing.logs.get(id, np.zeros(5)) for id in around}
 
         def of_totals(chosen: Mapping[str, int], logs: Mapping[str, np.ndarray] = logs) -> float:
@@ -244,9 +244,9 @@ def _best(
 
         for _ in range(3 if ids else 0):  # the totals share the light's common factor: one capture after the other
             for id in ids:
-                left = [gain[id][k] + of_totals({**chosen, id: k}) for k in range(len(gain[id]))]
+                left = [falls[id][k] + of_totals({**chosen, id: k}) for k in range(len(falls[id]))]
                 chosen[id] = int(np.argmax(left))
-        whole = of_totals(chosen) + sum(float(gain[id][k]) for id, k in chosen.items())
+        whole = of_totals(chosen) + sum(float(falls[id][k]) for id, k in chosen.items())
         if best is None or whole > best[0]:
             best = whole, t, {id: float(around[id][k]) % (2 * math.pi) for id, k in chosen.items()}
     assert best is not None

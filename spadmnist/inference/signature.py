@@ -124,8 +124,8 @@ class Signature:
         odd = half(up.shifts, down.shifts, -1.0)
         for cell in odd.keys() & (powers or {}).keys():
             typical = ndimage.median_filter(powers[cell], _NEIGHBOURS)  # type: ignore[index]  # a line's own has a sign
-            chance = 2 * typical * np.abs(even.shifts[cell]) / few  # variance of the noise that grows in proportion
-            odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * chance, odd[cell], 0.0)
+            variance = 2 * typical * np.abs(even.shifts[cell]) / few  # of the noise that grows in proportion
+            odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * variance, odd[cell], 0.0)
         scatters = up.fluctuates or down.fluctuates
         return Signature(
             shifts=odd,
@@ -305,9 +305,9 @@ def signature_from(
             shift, left, beta = mean_shift(new, old, spread)
             if kept != "all":
                 # where the replicates share no noise, that of the null distribution is in the shift, too
-                chance = left + 3.0 * (1 - beta) / null.recordings
-                usual_here, _ = evaluation.expected(cell, float(base.totals.mean()))
-                shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
+                noise_here = left + 3.0 * (1 - beta) / null.recordings
+                expected_here, _ = evaluation.expected(cell, float(base.totals.mean()))
+                shift = beyond_noise(shift, spread, noise_here, null, expected_here, len(other.totals), kept == "sure")
             if shift.any():
                 shifts[cell], noise[cell] = shift, left
     return Signature(shifts=shifts, noise=noise, logs=logs, nothing=nothing, fluctuates=scattered)

@@ -289,8 +289,8 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
         cell: (aside[0][cell] - aside[1][cell])[:, None] / (np.array(apart) - now)[None, :] / len(coordinates)
         for cell in residuals
     }
-    own = np.concatenate([evaluation.replicate_residuals[cell] for cell in residuals], axis=1)
-    covariance = covariance_of(np.concatenate(list(jacobian.values())), own)
+    replicate_residuals = np.concatenate([evaluation.replicate_residuals[cell] for cell in residuals], axis=1)
+    covariance = covariance_of(np.concatenate(list(jacobian.values())), replicate_residuals)
     one.fit = Fit(
         coordinates=coordinates,
         point=now,
