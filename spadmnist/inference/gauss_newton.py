@@ -14,7 +14,7 @@ from .evaluation import Evaluation, stacked
 from .levels import FALL_95, HALF_95
 from .models import Model
 from .replicates import FEW, CannotSimulate, Cell, Replicates
-from .signature import residuals_at, signatures
+from .signature import Sampling, residuals_at, signatures
 
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
 # of a logarithm: the step to both sides for a column of the Jacobian, the longest one; known errors make it shorter
@@ -116,8 +116,8 @@ def gauss_newton(
 
     def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | CannotSimulate]:
         models = [sensors_of(boosted(at(u))) for u in points]
-        names = [effort.names] * len(points)
-        found = signatures(replicates, evaluation, models, effort.few, effort.only, names_of=names)
+        sampling = Sampling(few=effort.few, only=effort.only, names=effort.names)
+        found = signatures(replicates, evaluation, models, sampling)
         times = factor ** -effort.stronger[1]
         return [
             m if isinstance(m, CannotSimulate) else stacked(residuals_at(replicates, evaluation, m, times), keys)
@@ -342,8 +342,7 @@ def _jacobian(
             replicates,
             evaluation,
             [sensors_of(values_there[k]) for k in some],
-            by.few,
-            kept="all" if bare else "likely",
+            Sampling(few=by.few, kept="all" if bare else "likely"),
             only_of=[only[k // 2] for k in some],
         )
         for k, m in zip(some, made, strict=True):
@@ -399,7 +398,7 @@ def profile_intervals(
         return fit.coordinates[i].coordinate(fit.coordinates[i].value(u))
 
     def squares(models: Sequence[Model]) -> np.ndarray:
-        keys, found = list(evaluation.residuals), signatures(replicates, evaluation, models, few)
+        keys, found = list(evaluation.residuals), signatures(replicates, evaluation, models, Sampling(few=few))
         z = [
             np.full(1, math.nan)
             if isinstance(m, CannotSimulate)

@@ -21,7 +21,7 @@ from .models import Model
 from .pixel_maps import map_values
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
 from .results import Step, Value
-from .signature import IGNORED, captures_showing, residuals_at, signatures
+from .signature import IGNORED, Sampling, captures_showing, residuals_at, signatures
 
 if TYPE_CHECKING:
     from .model_path import ModelPath
@@ -308,7 +308,8 @@ def bounded(path: ModelPath, fit: Fit) -> Fit:
     """
     replicates, evaluation, coordinates = path.replicates, path.evaluation, fit.coordinates
     there = {d.key: d.value(float(x)) for d, x in zip(coordinates, fit.point, strict=True)}
-    (signature,) = signatures(replicates, evaluation, [path.model_at(evaluation, there)], _recordings(evaluation))
+    sampling = Sampling(few=_recordings(evaluation))
+    (signature,) = signatures(replicates, evaluation, [path.model_at(evaluation, there)], sampling)
     now = square(evaluation.residuals)
     if isinstance(signature, CannotSimulate) or square(residuals_at(replicates, evaluation, signature)) > now + LOST:
         return replace(fit, point=point_of(coordinates, path.values), residuals=evaluation.residuals)

@@ -15,7 +15,7 @@ from .evaluation import Evaluation, evaluate
 from .light_levels import totals_space
 from .models import phase_parameters
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
-from .signature import Signature, residuals_at, residuals_shifted, signatures
+from .signature import Sampling, Signature, residuals_at, residuals_shifted, signatures
 from .spectral_lines import Line
 
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
@@ -125,7 +125,7 @@ def simulate_phases(
     turns = [2 * math.pi * k / _TURNS for k in range(_TURNS)]
     pairs = [(id, key) for id in replicates.seen for key in keys]
     models = [evaluation.sensors.changed(values, dict.fromkeys(pairs, turn)) for turn in turns]
-    found = signatures(replicates, evaluation, models, few, _lit(replicates))
+    found = signatures(replicates, evaluation, models, Sampling(few=few, only=_lit(replicates)))
     made: list[Signature] = []
     for one in found:
         if isinstance(one, CannotSimulate):
@@ -192,7 +192,7 @@ def choose_phase(
     pairs = [{(id, key): p for id, p in some.items() for key in keys} for some in (phases, mirrored)]
     left = []
     models = [evaluation.sensors.changed(values, some) for some in pairs]
-    for signature in signatures(replicates, evaluation, models, _MANY, _lit(replicates)):
+    for signature in signatures(replicates, evaluation, models, Sampling(few=_MANY, only=_lit(replicates))):
         if isinstance(signature, CannotSimulate):
             return dict(phases)
         squares = dict.fromkeys(phases, 0.0)

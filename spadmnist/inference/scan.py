@@ -23,7 +23,16 @@ from .models import Model
 from .phases import NEAR, TIMES, PeriodicSignatures
 from .replicates import FEW, CannotSimulate, Replicates
 from .score_test import best_direction, sigmas_of
-from .signature import Signature, fall_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
+from .signature import (
+    Sampling,
+    Signature,
+    fall_of,
+    odd_and_even,
+    residuals_at,
+    signature_of_totals,
+    signatures,
+    size_of,
+)
 from .spectral_lines import Line, spectral_lines
 from .trial import (
     BOLDER,
@@ -268,7 +277,9 @@ class Scan:
                 if opposite := _opposite(evaluation, one):
                     down[i] = opposite
         models = [one.sensors for one in tried if one.sensors is not None]
-        made = signatures(self.replicates, evaluation, [*models, *down.values()], few, only, kept="sure")
+        made = signatures(
+            self.replicates, evaluation, [*models, *down.values()], Sampling(few=few, only=only, kept="sure")
+        )
         downs = dict(zip(down, made[len(tried) :], strict=True))
         out = []
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):

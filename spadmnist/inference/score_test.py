@@ -21,7 +21,7 @@ from .coordinates import Key
 from .evaluation import Evaluation, stacked
 from .levels import LEAST_P
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
-from .signature import Signature, signatures, template_of
+from .signature import Sampling, Signature, signatures, template_of
 from .spectral_lines import Line
 from .statistic_maps import p_of_width
 from .trial import Trial, shape_of
@@ -154,7 +154,7 @@ def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: 
     )
     if one.sensors is not None and not template @ there:
         # so faint that each cell's shift may be noise and is left out; the projection of all shifts is significant
-        (whole,) = signatures(replicates, evaluation, [one.sensors], 2 * FEW, kept="all")
+        (whole,) = signatures(replicates, evaluation, [one.sensors], Sampling(few=2 * FEW, kept="all"))
         if not isinstance(whole, CannotSimulate):
             there = stacked(template_of(replicates, evaluation, whole), keys)
             least = _NOISE_SHARE

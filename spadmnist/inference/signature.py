@@ -153,32 +153,45 @@ def signature_of_totals(replicates: Replicates, evaluation: Evaluation, sensors:
         raise SpadError(why(error)) from error
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """What is simulated of a model for its signature, and what is kept of it.
+
+    Attributes:
+        few: replicates of each capture.
+        only: the captures that are simulated; all where it is empty.
+        names: the statistics that are reduced; all where it is empty.
+        hasty: without costly statistics.
+        kept: which shifts are kept. "sure": those that are hardly ever noise (a signature). "likely": those that are
+            hardly all noise (a derivative, which would otherwise be too small). "all": all.
+    """
+
+    few: int = FEW
+    only: Collection[str] = ()
+    names: Collection[str] = ()
+    hasty: bool = True
+    kept: Kept = "likely"
+
+
 def signatures(
     replicates: Replicates,
     evaluation: Evaluation,
     models: Sequence[Model],
-    few: int = FEW,
-    only: Collection[str] = (),
-    hasty: bool = True,
-    kept: Kept = "likely",
+    sampling: Sampling = Sampling(),
     only_of: Sequence[Collection[str]] | None = None,
-    names_of: Sequence[Collection[str]] | None = None,
 ) -> list[Signature | CannotSimulate]:
     """The signature of each model, or the error that says why it cannot be simulated.
 
     Args:
         models: the changed models.
-        few: replicates of each capture.
-        only: the captures that are simulated; all where it is empty.
-        hasty: without costly statistics.
-        kept: which shifts are kept. "sure": those that are hardly ever noise (a signature). "likely": those that are
-            hardly all noise (a derivative, which would otherwise be too small). "all": all.
-        only_of: as `only`, for each model by itself.
-        names_of: the statistics that are reduced, for each model; all where it is empty.
+        sampling: what is simulated of each of them.
+        only_of: as `Sampling.only`, for each model by itself.
     """
-    numbers = np.arange(few, dtype=np.uint64)
-    ids_of = [[id for id in evaluation.made if not some or id in some] for some in only_of or [only] * len(models)]
-    wanted, unable, names = [], dict[int, CannotSimulate](), list[Collection[str]]()
+    numbers = np.arange(sampling.few, dtype=np.uint64)
+    ids_of = [
+        [id for id in evaluation.made if not some or id in some] for some in only_of or [sampling.only] * len(models)
+    ]
+    wanted, unable = [], dict[int, CannotSimulate]()
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
         own = []
         try:
@@ -188,10 +201,10 @@ def signatures(
         except UNABLE as error:
             unable[k], own = CannotSimulate.because(error), []
         wanted += own
-        names += [names_of[k] if names_of else ()] * len(own)
-    simulated = replicates.simulate(wanted, hasty=hasty, names=names)
-    if kept == "sure":  # a derivative is a difference of the same few replicates and needs no more
-        simulated = _more_replicates(replicates, evaluation, wanted, simulated, hasty, names)
+    names = [sampling.names] * len(wanted)
+    simulated = replicates.simulate(wanted, hasty=sampling.hasty, names=names)
+    if sampling.kept == "sure":  # a derivative is a difference of the same few replicates and needs no more
+        simulated = _more_replicates(replicates, evaluation, wanted, simulated, sampling)
     results = iter(simulated)
     out: list[Signature | CannotSimulate] = []
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
@@ -200,7 +213,7 @@ def signatures(
             continue
         made = {id: next(results) for id in ids}
         try:
-            out.append(signature_from(replicates, evaluation, sensors, made, kept))
+            out.append(signature_from(replicates, evaluation, sensors, made, sampling.kept))
         except UNABLE as error:
             out.append(CannotSimulate.because(error))
     return out
@@ -211,8 +224,7 @@ def _more_replicates(
     evaluation: Evaluation,
     wanted: Sequence[tuple[Model, str, np.ndarray, np.ndarray]],
     made: list[CaptureReplicates | CannotSimulate],
-    hasty: bool,
-    names: Sequence[Collection[str]],
+    sampling: Sampling,
 ) -> list[CaptureReplicates | CannotSimulate]:
     """The replicates, and more of them where the totals of a few deviate from the closed form.
 
@@ -233,8 +245,8 @@ def _more_replicates(
         level = photons[0] / evaluation.factors[id][0]
         again.append((sensors, id, level * evaluation.factors[id][more.astype(int)], more))
     out = list(made)
-    some = [names[k] for k in doubtful]
-    found = replicates.simulate(again, hasty=hasty, names=some) if again else []
+    names = [sampling.names] * len(again)
+    found = replicates.simulate(again, hasty=sampling.hasty, names=names) if again else []
     for k, more_of in zip(doubtful, found, strict=True):
         first = out[k]
         out[k] = (
@@ -267,7 +279,7 @@ def signature_from(
 
     Args:
         made: the replicates of some captures; the totals of the others are those of the closed form.
-        kept: see `signatures`.
+        kept: see `Sampling`.
     Raises:
         CannotSimulate: where a capture could not be simulated.
     """
