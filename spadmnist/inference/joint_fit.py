@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,9 +81,13 @@ def fit_all(
     found: Fit | None = None
     path.approximate = False
     if coordinates:
-        known_columns = _side_by_side(evaluation, coordinates, columns)
-        given = evaluation, maps, coordinates, edge_errors(path, fit), known_columns, roughly, where_shown
-        found, evaluation, maps = repeated_steps(path, *given)
+        by = StepsBy(
+            errors=edge_errors(path, fit),
+            near=_side_by_side(evaluation, coordinates, columns),
+            roughly=roughly,
+            where_shown=where_shown,
+        )
+        found, evaluation, maps = repeated_steps(path, evaluation, maps, coordinates, by)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.approximate = path.approximate or (roughly and bool(maps))
     path.evaluation = evaluation
@@ -166,25 +170,39 @@ def _side_by_side(evaluation: Evaluation, coordinates: tuple[Coordinate, ...], f
     )
 
 
+@dataclass(frozen=True)
+class StepsBy:
+    """By what repeated steps find their Jacobians, and what they simulate again.
+
+    Attributes:
+        errors: standard deviations of coordinates, as in `JacobianBy`.
+        near: a fit whose Jacobian is taken at first.
+        roughly, where_shown: see `fit_all`.
+    """
+
+    errors: Mapping[Key, float] = field(default_factory=dict)
+    near: Fit | None = None
+    roughly: bool = False
+    where_shown: bool = False
+
+
 def repeated_steps(
     path: ModelPath,
     evaluation: Evaluation,
     maps: dict[Key, pixel_maps.PixelMap],
     coordinates: tuple[Coordinate, ...],
-    errors: Mapping[Key, float],
-    near: Fit | None = None,
-    roughly: bool = False,
-    where_shown: bool = False,
+    by: StepsBy = StepsBy(),
 ) -> tuple[Fit | None, Evaluation, dict[Key, pixel_maps.PixelMap]]:
     """(fit of all coordinates, evaluation of the model, its maps), from values near the best ones.
 
     The fit is None where the model cannot be simulated around them.
 
     Args:
-        near: a fit whose Jacobian is taken at first.
-        roughly, where_shown: see `fit_all`.
+        evaluation, maps: of the model at the start.
+        coordinates: what is fitted.
     """
     replicates, known = path.replicates, _known_jacobian(path)
+    near, roughly = by.near, by.roughly
     fit: Fit | None = None
     rejected: Fit | None = None  # by known columns, at the values from which they led nowhere
     path.approximate = near is not None
@@ -194,10 +212,10 @@ def repeated_steps(
         turn += 1
         here = {d.key: path.values[d.key] for d in coordinates}
         try:
-            only = functools.partial(_shown, path) if where_shown else lambda key: ()
-            by = JacobianBy(few=_recordings(evaluation), errors=errors, known=known, before=near, only=only)
+            only = functools.partial(_shown, path) if by.where_shown else lambda key: ()
+            jacobian_by = JacobianBy(few=_recordings(evaluation), errors=by.errors, known=known, before=near, only=only)
             model = functools.partial(path.model_at, evaluation)
-            closer = gauss_newton_step(replicates, evaluation, coordinates, here, model, by)
+            closer = gauss_newton_step(replicates, evaluation, coordinates, here, model, jacobian_by)
         except CannotSimulate as error:
             path.no_fit_because = str(error)
             path.approximate = path.approximate or borrowed_columns
