@@ -15,7 +15,7 @@ from spadmnist.inference.coordinates import Key
 from spadmnist.inference.model_path import ModelPath, accept
 from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.inference.scan import Scan
-from spadmnist.inference.signature import Signature, signatures
+from spadmnist.inference.signature import Sampling, Signature, signatures
 from spadmnist.inference.trial import Trial
 from spadmnist.inference.trial_fits import fit_trial
 from spadmnist.measurement import Measurement
@@ -104,7 +104,7 @@ def given(path: ModelPath, name: str, values: dict[Key, Any], fitted: bool) -> T
     """A candidate at some values, or fitted from there."""
     replicates, evaluation = path.replicates, path.evaluation
     candidate = next(c for c in candidates(evaluation.sensors.one) if c.name == name)
-    (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], kept="sure")
+    (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], Sampling(kept="sure"))
     assert isinstance(signature, Signature)
     one = Trial(candidate, values, signature, 0.0, 1.0)
     return fit_trial(path.replicates, evaluation, one) if fitted else one

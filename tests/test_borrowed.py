@@ -12,7 +12,7 @@ from spadmnist.inference.joint_fit import complete_fit, completed
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.score_test import PIXELS
-from spadmnist.inference.signature import Signature, captures_informing, signatures, statistics_showing
+from spadmnist.inference.signature import Sampling, Signature, captures_informing, signatures, statistics_showing
 
 RATE = ("dark_counts", "rate")
 
@@ -90,7 +90,7 @@ def test_only_the_statistics_that_are_named_are_reduced(lab) -> None:
     spent = replicates.budget.spent
     (whole,) = signatures(replicates, base, [model])
     full, spent = replicates.budget.spent - spent, replicates.budget.spent
-    (some,) = signatures(replicates, base, [model], names_of=[["neighbours", "spacing"]])
+    (some,) = signatures(replicates, base, [model], Sampling(names=["neighbours", "spacing"]))
     assert isinstance(whole, Signature) and isinstance(some, Signature)
     assert {name for _, name in some.shifts} <= {"neighbours", "spacing"} < {name for _, name in whole.shifts}
     for cell, shift in some.shifts.items():

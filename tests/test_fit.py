@@ -123,7 +123,7 @@ def test_what_cannot_be_fitted_is_told(tmp_path, made):
 def closed_form(monkeypatch, function, asked=None):
     """Models are numbers (a, b), and their residuals a function of them. asked: takes how many each call simulates."""
 
-    def simulated(replicates, evaluation, models, few, only=None, names_of=None):
+    def simulated(replicates, evaluation, models, sampling):
         if asked is not None:
             asked.append(len(models))
         return models

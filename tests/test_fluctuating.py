@@ -19,7 +19,7 @@ from spadmnist.inference.joint_fit import bounded, repeated_steps
 from spadmnist.inference.laws import Law
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.replicates import TOTALS
-from spadmnist.inference.signature import Signature, mean_deviation, signatures
+from spadmnist.inference.signature import Sampling, Signature, mean_deviation, signatures
 from spadmnist.inference.trial import Trial
 from spadmnist.inference.trial_fits import fit_trial
 
@@ -34,17 +34,17 @@ def test_totals_that_go_the_same_way_in_two_recordings_are_chance(lab) -> None:
     evaluation = evaluate(replicates, {})
     coherence = [1e-3, 3e-3, 1e-2, 3e-2]  # of an exposure of 20 ms
     models = [evaluation.sensors.changed({CONTRAST: 0.1, COHERENCE: x}) for x in coherence]
-    for signature in signatures(replicates, evaluation, models, 2, kept="sure"):
+    for signature in signatures(replicates, evaluation, models, Sampling(few=2, kept="sure")):
         assert isinstance(signature, Signature)
         assert signature.fluctuates
         assert all(abs(log) < 1e-6 for log in signature.logs.values())
     # nor are four of them sure of it, of which a slope is made: they are far less alike than the model's own
-    for signature in signatures(replicates, evaluation, models, 4):
+    for signature in signatures(replicates, evaluation, models, Sampling(few=4)):
         assert isinstance(signature, Signature)
         assert all(abs(log) < 1e-6 for log in signature.logs.values())
     # what adds detections in every recording is none of these
     (signature,) = signatures(
-        replicates, evaluation, [evaluation.sensors.changed({("afterpulsing", "probability"): 0.1})], 4
+        replicates, evaluation, [evaluation.sensors.changed({("afterpulsing", "probability"): 0.1})], Sampling(few=4)
     )
     assert isinstance(signature, Signature)
     assert not signature.fluctuates
@@ -72,7 +72,9 @@ def test_a_lamp_is_seen_to_fluctuate_beside_a_chip_that_is_not_known_exactly(lab
     sensors = evaluate(replicates, {}).sensors.changed({}, chips=True)
     evaluation = evaluate(replicates, {}, sensors)
     for contrast in (0.1, 1e-4):
-        (signature,) = signatures(replicates, evaluation, [sensors.changed({CONTRAST: contrast, COHERENCE: 3e-3})], 4)
+        (signature,) = signatures(
+            replicates, evaluation, [sensors.changed({CONTRAST: contrast, COHERENCE: 3e-3})], Sampling(few=4)
+        )
         assert isinstance(signature, Signature)
         assert signature.fluctuates == (contrast > 0.01)
 
@@ -86,8 +88,8 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
 
     def evaluation(width: float, other: float) -> Any:
         null = {
-            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law(), own=STEADY),
-            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), own=STEADY),
+            TREND: SimpleNamespace(breadth=width, factor=1.0, law=Law(), replicate_squares=STEADY),
+            MANY: SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), replicate_squares=STEADY),
         }
         left = {TREND: z / width, MANY: np.full(1000, other), TOTALS: totals / width}
         return SimpleNamespace(nulls=null, residuals=left, space=([], np.ones(3), np.eye(3) / width, np.zeros(3)))
@@ -110,7 +112,9 @@ def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> N
     evaluation = evaluate(replicates, {})
     assert float(np.max(np.abs(evaluation.residuals[TOTALS]))) > 4.0
     values = {CONTRAST: 0.15, COHERENCE: 30e-3}
-    (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], 8, kept="sure")
+    (signature,) = signatures(
+        replicates, evaluation, [evaluation.sensors.changed(values)], Sampling(few=8, kept="sure")
+    )
     assert isinstance(signature, Signature)
     one = fit_trial(
         replicates, evaluation, Trial(change_of(replicates, "add source_noise"), values, signature, 0.0, 1.0)
@@ -150,10 +154,10 @@ def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, 
             path.evaluation = evaluate(path.replicates, {CONTRAST: 0.2, COHERENCE: 20e-3})
         held: list[int] = []
         with monkeypatch.context() as patch:
-            patch.setattr("spadmnist.inference.joint_fit.signatures", lambda *a: held.append(a[3]) or simulated(*a))  # noqa: B023
+            patch.setattr("spadmnist.inference.joint_fit.signatures", lambda *a: held.append(a[3].few) or simulated(*a))  # noqa: B023
             coordinates = tuple(change_of(path.replicates, "add crosstalk").coordinates[:1])
             path.values[CROSSTALK] = 0.01
-            found, _, _ = repeated_steps(path, path.evaluation, {}, coordinates, {})
+            found, _, _ = repeated_steps(path, path.evaluation, {}, coordinates)
             assert found is not None
             held.clear()
             bounded(path, found)

@@ -354,3 +354,50 @@ def test_the_search_asks_for_no_unit_and_no_stage(file: str) -> None:
             names = {side.attr for side in [node.left, *node.comparators] if isinstance(side, ast.Attribute)}
             told = any(isinstance(x, ast.Constant) for side in node.comparators for x in ast.walk(side))
             assert not (names & {"unit", "stage"} and told), f"{file}:{node.lineno}"
+
+
+@functools.cache
+def records() -> frozenset[str]:
+    """The dataclasses and named tuples of the inference, by their names alone."""
+    found = set()
+    for file in MODULES:
+        for node in ast.walk(parsed(file)) if file.startswith("inference/") else ():
+            if isinstance(node, ast.ClassDef):
+                above = [ast.unparse(one) for one in [*node.decorator_list, *node.bases]]
+                if any(re.match(r"(dataclasses\.)?dataclass\b|(typing\.)?NamedTuple\b", one) for one in above):
+                    found.add(node.name)
+    return frozenset(found)
+
+
+def built_by_place(file: str) -> Iterator[tuple[int, str]]:
+    """(line, class) of the calls of a record of the inference with four or more arguments that have no name.
+
+    What is unpacked into its place counts as two: (low, high).
+    """
+    inside = file.startswith("inference/")
+    tree = parsed(file)
+    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    known = {}  # what a name stands for here: a record of the inference, or a module of it
+    for node in classes if inside else ():
+        known[node.name] = node.name
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and ((inside and node.level == 1) or "inference" in (node.module or "")):
+            known |= {alias.asname or alias.name: alias.name for alias in node.names}
+    itself = {id(inner): node.name for node in classes if inside for inner in ast.walk(node)}
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        name = ast.unparse(node.func)
+        if name in {"cls", "type(self)"}:
+            name = itself.get(id(node), "")
+        head, _, last = name.rpartition(".")
+        made = last if head in known else known.get(name, "")
+        if made in records() and len(node.args) + sum(isinstance(x, ast.Starred) for x in node.args) >= 4:
+            yield node.lineno, made
+
+
+@pytest.mark.parametrize("file", list(MODULES))
+def test_no_result_of_the_inference_is_built_by_place(file: str) -> None:
+    """A field that is added or moved would go to the wrong place without a word."""
+    found = [f"{file}:{line} {name}" for line, name in built_by_place(file)]
+    assert not found, "four or more arguments without a name: " + ", ".join(found)

@@ -58,7 +58,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch, step: float, noise: np.ndarray) -> d
     monkeypatch.setattr(joint_fit, "gauss_newton_step", one_step)
     monkeypatch.setattr(joint_fit, "evaluate", lambda replicates, values, sensors: evaluation_at(values, noise))
     begun = evaluation_at(start, np.zeros(CELLS))
-    _, found, _ = joint_fit.repeated_steps(path, begun, {}, (STRENGTH, SHAPE), {})
+    _, found, _ = joint_fit.repeated_steps(path, begun, {}, (STRENGTH, SHAPE))
     return dict(found.values)
 
 

@@ -27,7 +27,7 @@ from spadmnist.inference.pixel_maps import PixelMap
 from spadmnist.inference.replicates import TOTALS, CannotSimulate
 from spadmnist.inference.results import Step, mimic
 from spadmnist.inference.score_test import ScoreTest, explains_its_signature
-from spadmnist.inference.signature import Signature, fall_of, residuals_at, signatures
+from spadmnist.inference.signature import Sampling, Signature, fall_of, residuals_at, signatures
 from spadmnist.inference.spectral_lines import Line
 from spadmnist.inference.trial import Trial, weaker
 
@@ -65,7 +65,7 @@ def test_models_may_be_looked_at_in_captures_of_their_own(lab):
     models = [evaluation.sensors.changed({CROSSTALK: x}) for x in (0.05, 0.1)]
     mixed = signatures(replicates, evaluation, models, only_of=[["flat"], ["dark"]])
     for signature, model, id in zip(mixed, models, ("flat", "dark"), strict=True):
-        (alone,) = signatures(replicates, evaluation, [model], only=[id])
+        (alone,) = signatures(replicates, evaluation, [model], Sampling(only=[id]))
         assert isinstance(signature, Signature) and isinstance(alone, Signature)
         assert signature.shifts.keys() == alone.shifts.keys() and {cell[0] for cell in signature.shifts} == {id}
         for cell, shift in alone.shifts.items():

@@ -41,7 +41,7 @@ from spadmnist.inference.score_test import (
     p_values,
     score_test,
 )
-from spadmnist.inference.signature import Signature, signature_of_totals, signatures, template_of
+from spadmnist.inference.signature import Sampling, Signature, signature_of_totals, signatures, template_of
 from spadmnist.inference.trial import Trial
 from spadmnist.inference.trial_fits import boost_of, fit_whole_number
 from spadmnist.recording import Capture, Light
@@ -240,7 +240,9 @@ def test_the_power_with_which_a_trace_grows(lab, name: str, values: dict[Any, An
     """Probabilities in proportion, fluctuations with the square: whatever chance hides of a faint trace."""
     replicates = bench_of(lab(light=900, side=4))
     evaluation = evaluate(replicates, {})
-    (signature,) = signatures(replicates, evaluation, [evaluation.sensors.changed(values)], 2, kept="sure")
+    (signature,) = signatures(
+        replicates, evaluation, [evaluation.sensors.changed(values)], Sampling(few=2, kept="sure")
+    )
     assert isinstance(signature, Signature)
     boost, found = boost_of(
         replicates, evaluation, Trial(change_of(replicates, f"add {name}"), values, signature, 0.0, 1.0), values
@@ -380,7 +382,7 @@ def test_a_light_that_fluctuates_makes_squares_fall_and_has_no_evidence(lab) -> 
     evaluation = evaluate(replicates, {})
     values = {("source_noise", "contrast"): 0.2, ("source_noise", "coherence_time"): 2.0}
     sensors = evaluation.sensors.changed(values)
-    (signature,) = signatures(replicates, evaluation, [sensors], 8, kept="sure")
+    (signature,) = signatures(replicates, evaluation, [sensors], Sampling(few=8, kept="sure"))
     assert isinstance(signature, Signature)
     one = Trial(change_of(replicates, "add source_noise"), values, signature, 0.0, 1.0, sensors)
     found = evidence_of(replicates, evaluation, one)
@@ -428,7 +430,7 @@ def test_a_model_that_scatters_more_is_not_likelier_for_that(law: str) -> None:
 
 def test_where_a_model_has_no_trace_chance_does_not_speak_for_it() -> None:
     """A thousand cells in which it does nothing happen to lie nearer to it; in the one where it does, data lie away."""
-    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), own=np.ones(32))
+    null = SimpleNamespace(breadth=1.0, factor=1.0, law=Law(), replicate_squares=np.ones(32))
     now, there = (
         SimpleNamespace(
             nulls={CELL: null, OTHER: null}, residuals={CELL: np.array([x]), OTHER: np.full(1000, y)}, space=None

@@ -13,7 +13,7 @@ from spadmnist.inference.map_fits import width_of_most
 from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.score_test import best_direction, most_significant, p_of_best
 from spadmnist.inference.sharper_tests import sharper
-from spadmnist.inference.signature import Signature, signatures, template_of
+from spadmnist.inference.signature import Sampling, Signature, signatures, template_of
 from spadmnist.inference.trial import Trial
 
 # 0.05 % of detections come again after 150 ns, between the two templates at 50 ns and at 230 ns
@@ -36,7 +36,7 @@ def cosine(looked: tuple[Replicates, Evaluation, list[Trial], list[Trial]], one:
     """The cosine of a trial's template and that of the true effect, ten times stronger, from 32 replicates."""
     replicates, evaluation, *_ = looked
     truth = evaluation.sensors.changed({PROBABILITY: 0.005, LIFETIME: 150e-9})
-    (true,) = signatures(replicates, evaluation, [truth], 32, kept="sure")
+    (true,) = signatures(replicates, evaluation, [truth], Sampling(few=32, kept="sure"))
     assert isinstance(true, Signature)
     a, b = (stacked(template_of(replicates, evaluation, s), list(evaluation.residuals)) for s in (one.signature, true))
     return float(a @ b) / math.sqrt(float(a @ a) * float(b @ b))

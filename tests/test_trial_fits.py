@@ -65,7 +65,7 @@ def test_an_edge_is_probed_to_some_ten_picoseconds(monkeypatch) -> None:
         return {("flat", "edge"): np.array([math.sqrt(2e4 * abs(math.log(values[DURATION] / truth)))])}
 
     monkeypatch.setattr(
-        "spadmnist.inference.trial_fits.signatures", lambda replicates, evaluation, models, few, only, names_of: models
+        "spadmnist.inference.trial_fits.signatures", lambda replicates, evaluation, models, sampling: models
     )
     monkeypatch.setattr(
         "spadmnist.inference.trial_fits.residuals_at", lambda replicates, evaluation, values: cost(values)

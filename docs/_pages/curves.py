@@ -87,9 +87,9 @@ def significance(one: Drawn, other: Drawn) -> np.ndarray:
     """(points,) by how many standard errors two curves differ; 0 where one has no value."""
     # where neither scatters, as where nothing was counted, the error is taken to be that of the others
     scatter = np.hypot(one.error, other.error)
-    usual = np.nanmedian(scatter[scatter > 0]) if np.any(scatter > 0) else 1.0
+    typical = np.nanmedian(scatter[scatter > 0]) if np.any(scatter > 0) else 1.0
     with np.errstate(invalid="ignore"):
-        return np.nan_to_num((one.y - other.y) / np.maximum(scatter, 0.3 * usual))
+        return np.nan_to_num((one.y - other.y) / np.maximum(scatter, 0.3 * typical))
 
 
 def visible(one: Drawn, other: Drawn) -> float:

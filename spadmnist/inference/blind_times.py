@@ -222,6 +222,12 @@ def width_of(grid: np.ndarray, likely: np.ndarray, others: float = _OTHERS) -> W
         share = (tops[k, 0] - wanted) / max(tops[k, 0] - tops[j, 0], 1e-12)
         return float(sigmas[k] * (sigmas[j] / sigmas[k]) ** min(max(share, 0.0), 1.0))
 
-    ends = min(between(low, low - 1), sigma), max(between(high, high + 1), sigma)
-    likelihood_ratio = max(2 * (top - float(tops[0, 0])), 0.0)
-    return Width(sigma, *ends, middle, likelihood_ratio, _law(grid, sigma, middle, others), top)
+    return Width(
+        sigma=sigma,
+        low=min(between(low, low - 1), sigma),
+        high=max(between(high, high + 1), sigma),
+        middle=middle,
+        likelihood_ratio=max(2 * (top - float(tops[0, 0])), 0.0),
+        prior=_law(grid, sigma, middle, others),
+        log_likelihood=top,
+    )

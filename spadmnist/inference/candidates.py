@@ -153,7 +153,15 @@ def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Candi
     lines = [p for p in parameters.values() if p.per in ("row", "column", "code") and p.off is not None]
     if lines:
         one = lines[0]
-        yield Candidate("add", name, None, (), per=one.per, carrier=(name, one.name), relative=one.off == 1.0)
+        yield Candidate(
+            kind="add",
+            effect=name,
+            parameter=None,
+            strengths=(),
+            per=one.per,
+            carrier=(name, one.name),
+            relative=one.off == 1.0,
+        )
     if not off:
         return
     signed = {k: p for k, p in off.items() if p.search is not None and p.search[0] < 0}
@@ -162,7 +170,9 @@ def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Candi
     if signed:  # components of one vector: all of them may be there
         strengths = tuple(coordinate_of(name, p, float(p.off or 0)) for p in off.values())
         fixed = tuple(((name, k), float(p.off or 0)) for k, p in off.items())
-        yield Candidate("add", name, None, strengths, shapes, phases, fixed)
+        yield Candidate(
+            kind="add", effect=name, parameter=None, strengths=strengths, shapes=shapes, phases=phases, fixed=fixed
+        )
         return
     strengths = tuple(coordinate_of(name, p, float(p.off or 0)) for p in kept.values())
     # a parameter that is off by default is no shape
@@ -170,14 +180,16 @@ def _additions(name: str, parameters: Mapping[str, Parameter]) -> Iterator[Candi
         if p.default == p.off:
             continue
         shapes += (coordinate_of(name, p, None),)
-    yield Candidate("add", name, None, strengths, shapes, phases)
+    yield Candidate(kind="add", effect=name, parameter=None, strengths=strengths, shapes=shapes, phases=phases)
 
 
 def _settings(effect: Effect) -> Iterator[Candidate]:
     for name, declared in effect.parameters.items():
         value = getattr(effect, name)
         if declared.kind == "switch" and declared.off is not None:
-            yield Candidate("set", effect.name, name, (), fixed=(((effect.name, name), not value),))
+            yield Candidate(
+                kind="set", effect=effect.name, parameter=name, strengths=(), fixed=(((effect.name, name), not value),)
+            )
         if not _numeric(declared) or declared.per not in ("", "pixel") or not isinstance(value, (int, float)):
             continue
         if declared.kind == "phase" or (effect.on_light and not effect.of_scene):
@@ -189,7 +201,7 @@ def _settings(effect: Effect) -> Iterator[Candidate]:
         # what does nothing without this parameter has had no value so far
         idle = [p for p in effect.parameters.values() if p.needs == name and _numeric(p) and p.per in ("", "pixel")]
         shapes = tuple(coordinate_of(effect.name, p, None) for p in idle) if value == declared.off else ()
-        yield Candidate("set", effect.name, name, (coordinate,), shapes)
+        yield Candidate(kind="set", effect=effect.name, parameter=name, strengths=(coordinate,), shapes=shapes)
 
 
 def _about(value: float, declared: Parameter) -> tuple[float, float]:
@@ -219,7 +231,15 @@ def _maps(sensor: Sensor, effect: Effect, fitted: Collection[Key]) -> Iterator[C
         blinds = not declared.informed_by and declared.kind in ("time", "edge") and _blinds(sensor, key, value)
         own = declared.informed_by
         yield Candidate(
-            "per_pixel", effect.name, name, (), per="pixel", carrier=key, relative=True, blinds=blinds, informed_by=own
+            kind="per_pixel",
+            effect=effect.name,
+            parameter=name,
+            strengths=(),
+            per="pixel",
+            carrier=key,
+            relative=True,
+            blinds=blinds,
+            informed_by=own,
         )
 
 

@@ -77,7 +77,7 @@ def checks_together(
     for by_place, judge in ((True, _alike), (False, _in_squares)):
         for cells in _groups(replicates, residuals, by_place):
             host = max(cells, key=lambda cell: replicates.seen[cell[0]].total)
-            some = [cell for cell in cells if alone[cell] >= CLEARLY and evaluation.nulls[cell].own.any()]
+            some = [cell for cell in cells if alone[cell] >= CLEARLY and evaluation.nulls[cell].replicate_squares.any()]
             out.append(judge(evaluation, host, some, residuals) if len(some) > 1 else Together(host))
     return out
 
@@ -107,7 +107,7 @@ def _alike(evaluation: Evaluation, host: Cell, cells: Sequence[Cell], residuals:
     most = float(z[worst])
     order = sorted(cells, key=lambda cell: -most * float(residuals[cell][worst]))
     beyond = max(most**2, float(z @ z) - z.size)
-    return Together(host, p, worst, most, tuple(order), True, beyond)
+    return Together(cell=host, p=p, worst=worst, z=most, cells=tuple(order), alike=True, excess=beyond)
 
 
 def _law_of_sums(evaluation: Evaluation, cells: Sequence[Cell]) -> Null:
@@ -118,16 +118,17 @@ def _law_of_sums(evaluation: Evaluation, cells: Sequence[Cell]) -> Null:
 
         Each replicate informs its own expectation and scatter: its residuals are too small by a few per cent.
         """
-        own, null = evaluation.replicate_residuals[cell], evaluation.nulls[cell]
-        return own * math.sqrt(float(null.own.mean()) / max(float(np.mean(own**2)), _LEAST))
+        residuals, null = evaluation.replicate_residuals[cell], evaluation.nulls[cell]
+        return residuals * math.sqrt(float(null.replicate_squares.mean()) / max(float(np.mean(residuals**2)), _LEAST))
 
     sums = _sum([scores(cell) for cell in cells]) / math.sqrt(len(cells))
-    own = np.mean(sums**2, axis=1)
     null = evaluation.nulls[cells[0]]
     contrasts = null.contrasts
     if contrasts is not None:
         contrasts = in_scatters(contrasts / np.linalg.norm(contrasts, axis=1, keepdims=True), sums)
-    return replace(null, own=own, tail=tail_of(sums), recordings=len(sums), contrasts=contrasts)
+    return replace(
+        null, replicate_squares=np.mean(sums**2, axis=1), tail=tail_of(sums), recordings=len(sums), contrasts=contrasts
+    )
 
 
 def _in_squares(
@@ -140,11 +141,20 @@ def _in_squares(
     p = p_of_squares(square, mean, variance)
     # the scatter of its cells makes a capture clear, relative to that of other recordings
     order = sorted(
-        cells, key=lambda cell: -float(np.mean(residuals[cell] ** 2)) / float(evaluation.nulls[cell].own.mean())
+        cells,
+        key=lambda cell: -float(np.mean(residuals[cell] ** 2)) / float(evaluation.nulls[cell].replicate_squares.mean()),
     )
     first = residuals[order[0]]
     worst = int(np.argmax(np.abs(first)))
-    return Together(host, p, worst, float(first[worst]), tuple(order), False, max(square - mean, 0.0))
+    return Together(
+        cell=host,
+        p=p,
+        worst=worst,
+        z=float(first[worst]),
+        cells=tuple(order),
+        alike=False,
+        excess=max(square - mean, 0.0),
+    )
 
 
 def _moments_of_squares(evaluation: Evaluation, sizes: Mapping[Cell, int]) -> tuple[float, float]:
@@ -157,8 +167,8 @@ def _moments_of_squares(evaluation: Evaluation, sizes: Mapping[Cell, int]) -> tu
     mean = sum(size * nulls[cell].moments_of_squares(size)[0] for cell, size in sizes.items())
     # at least that of independent captures, which the law of their cells bounds
     apart = sum(size**2 * nulls[cell].moments_of_squares(size)[1] for cell, size in sizes.items())
-    number = min(len(null.own) for null in nulls.values())
-    together = _sum([size * nulls[cell].own[:number] for cell, size in sizes.items()])
+    number = min(len(null.replicate_squares) for null in nulls.values())
+    together = _sum([size * nulls[cell].replicate_squares[:number] for cell, size in sizes.items()])
     return mean, max(apart, float(together.var(ddof=1)) * widening(number))
 
 

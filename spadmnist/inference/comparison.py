@@ -170,7 +170,16 @@ def _deviation(check: Check) -> Deviation:
         worst, residuals, axis = check.judgement.worst, check.judgement.residuals, check.summary.axis
         where = check.summary.where(worst)  # the place alone
         at = None if axis is None or check.summary.shape is not None else float(axis[worst])
-    return Deviation(check.statistic, check.capture, beyond, worst, where, check.relative, residuals, at)
+    return Deviation(
+        statistic=check.statistic,
+        capture=check.capture,
+        excess=beyond,
+        worst=worst,
+        where=where,
+        size=check.relative,
+        residuals=residuals,
+        at=at,
+    )
 
 
 def _plain(value: float) -> float:
@@ -260,7 +269,16 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
                     where, beyond = where + least.words, max(beyond, least.excess)
                     relative = _relative(replicates, evaluation, least)
                 own = Check(
-                    name, id, misfit, p, where, text, relative, excess=beyond, summary=summary, judgement=judged
+                    statistic=name,
+                    capture=id,
+                    misfit=misfit,
+                    p_value=p,
+                    where=where,
+                    size=text,
+                    relative=relative,
+                    excess=beyond,
+                    summary=summary,
+                    judgement=judged,
                 )
                 checks.append(replace(own, tests=1 + len(here)))
     captures = [seen.capture for seen in replicates.seen.values()]
@@ -272,15 +290,15 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     checks = holm_corrected([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
     sensor = replicates.start
     return Comparison(
-        sensor.name,
-        replicates.measurement.name,
-        "adequate" if all(c.passes for c in checks) else "fails",
-        mean_misfit(evaluation.replicate_residuals, evaluation.residuals),
-        misfit_null_95(evaluation.replicate_residuals),
-        tuple(nuisances),
-        tuple(checks),
-        len(evaluation.replicate_residuals[TOTALS]),
-        tolerance,
+        sensor=sensor.name,
+        measurement=replicates.measurement.name,
+        verdict="adequate" if all(c.passes for c in checks) else "fails",
+        misfit=mean_misfit(evaluation.replicate_residuals, evaluation.residuals),
+        misfit_null_95=misfit_null_95(evaluation.replicate_residuals),
+        nuisances=tuple(nuisances),
+        checks=tuple(checks),
+        replicates=len(evaluation.replicate_residuals[TOTALS]),
+        tolerance=tolerance,
         crop=str(sensor.window) if sensor.window else None,
         full=tuple(id for id, seen in replicates.seen.items() if seen.is_full(sensor)),
     )
@@ -336,7 +354,17 @@ def ratios_between_wavelengths(captures: Sequence[Capture], checks: Sequence[Che
         names = " over ".join(units.show(wave, "m") for wave in (long, short))
         size = f"{100 * float(difference[worst]):+.2f} % in the worst pixel"
         p = min(1.0, 2 * min(p_sum, p_cell))
-        out.append(Check("wavelength_ratio", None, square, p, f"{place}, {names}", size, float(difference[worst])))
+        out.append(
+            Check(
+                statistic="wavelength_ratio",
+                capture=None,
+                misfit=square,
+                p_value=p,
+                where=f"{place}, {names}",
+                size=size,
+                relative=float(difference[worst]),
+            )
+        )
     return out
 
 
@@ -368,7 +396,9 @@ def _level_checks(
     if lost:
         full = made.saturated or total > mean
         where = f"all pixels, {'too much light to count' if full else 'hardly any light'}"
-    return [Check("rate", capture.id, z * z, p, where, size, relative)]
+    return [
+        Check(statistic="rate", capture=capture.id, misfit=z * z, p_value=p, where=where, size=size, relative=relative)
+    ]
 
 
 def light_of(
@@ -401,16 +431,16 @@ def light_of(
     pull = own / math.hypot(common, own_error)
     name = "light"
     low, high = (math.exp(best + k * spread) for k in (-HALF_95, HALF_95))
-    nuisances = [Nuisance(None, name, math.exp(best), low, high, pull, common)]
+    nuisances = [Nuisance(capture=None, name=name, value=math.exp(best), low=low, high=high, pull=pull, stated=common)]
     checks = [
         Check(
-            name,
-            None,
-            pull**2,
-            float(2 * stats.norm.sf(abs(pull))),
-            "all lit captures",
-            f"light {100 * math.expm1(own):+.2f} % relative to the stated level, known to {100 * common:.2f} %",
-            math.expm1(own),
+            statistic=name,
+            capture=None,
+            misfit=pull**2,
+            p_value=float(2 * stats.norm.sf(abs(pull))),
+            where="all lit captures",
+            size=f"light {100 * math.expm1(own):+.2f} % relative to the stated level, known to {100 * common:.2f} %",
+            relative=math.expm1(own),
         )
     ]
     for (capture, log, _, elasticity), e, power in zip(levels, error, follows, strict=True):
@@ -421,10 +451,22 @@ def light_of(
         if capture.light.own_uncertainty > 0:
             low, high = (math.exp(log + k * e) for k in (-HALF_95, HALF_95))
             stated = capture.light.own_uncertainty
-            nuisances.append(Nuisance(capture.id, name, math.exp(log), low, high, z, stated))
+            nuisances.append(
+                Nuisance(capture=capture.id, name=name, value=math.exp(log), low=low, high=high, pull=z, stated=stated)
+            )
         change = math.expm1((log - mean) * elasticity)
         size = f"{100 * change:+.2f} % detections relative to the other captures"
-        checks.append(Check("rate", capture.id, z * z, float(2 * stats.norm.sf(abs(z))), "all pixels", size, change))
+        checks.append(
+            Check(
+                statistic="rate",
+                capture=capture.id,
+                misfit=z * z,
+                p_value=float(2 * stats.norm.sf(abs(z))),
+                where="all pixels",
+                size=size,
+                relative=change,
+            )
+        )
     return nuisances, checks
 
 

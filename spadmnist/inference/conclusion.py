@@ -72,7 +72,7 @@ def so_far(path: ModelPath, start: Evaluation, notes: Notes) -> Diagnosis:
     """The diagnosis while the search goes on."""
     verdict = verdict_of(path, left_over(path, notes), notes)
     null_95 = misfit_null_95(path.ladder[0].evaluation.replicate_residuals)
-    found = answer(path, start, notes, verdict, path.ladder, null_95, ([], [], []), None)
+    found = answer(path, start, notes, verdict, LastLook(path.ladder, null_95))
     found.steps = [replace(step, alternatives=[public(other) for other in step.alternatives]) for step in path.steps]
     found.finished = False
     found.untried = [*found.untried, not_done("further steps", "the search goes on")]
@@ -104,42 +104,47 @@ def not_done(where: str, why: str) -> dict[str, Any]:
     return {"change": None, "effect": None, "parameter": None, "where": where, "why": why}
 
 
-def answer(
-    path: ModelPath,
-    start: Evaluation,
-    notes: Notes,
-    verdict: str,
-    rungs: Sequence[Rung],
-    null_95: float,
-    limits: Limits,
-    in_sample: Comparison | None,
-) -> Diagnosis:
-    """The diagnosis.
+@dataclass(frozen=True)
+class LastLook:
+    """What is measured once there are no further steps.
 
-    Args:
-        start: the evaluation of the model without steps.
+    Attributes:
         rungs: the rows of the table of steps.
         null_95: 95 % of the misfits of a right model lie below.
         limits: as `upper_limits.upper_limits` returns them.
         in_sample: the comparison of the model with its steps; None where there is none.
     """
+
+    rungs: Sequence[Rung]
+    null_95: float
+    limits: Limits = field(default_factory=lambda: ([], [], []))
+    in_sample: Comparison | None = None
+
+
+def answer(path: ModelPath, start: Evaluation, notes: Notes, verdict: str, last: LastLook) -> Diagnosis:
+    """The diagnosis.
+
+    Args:
+        start: the evaluation of the model without steps.
+        last: what is measured at the end; of a search that goes on, the rows so far.
+    """
     replicates = path.replicates
     remains = verdict in ("unexplained", "partly_explained") or (verdict == "confused" and not path.steps)
-    excluded, invisible, unlimited = limits
+    excluded, invisible, unlimited = last.limits
     path.locate()
     return Diagnosis(
         sensor=replicates.start.name,
         measurement=replicates.measurement.name,
         verdict=verdict,
-        before=rungs[0].misfit,
+        before=last.rungs[0].misfit,
         after=(path.ladder[-1] if path.steps else path.ladder[0]).misfit,
-        null_95=null_95,
+        null_95=last.null_95,
         # of the last values, where they were compared: the evaluation may be that of values near them
-        nuisances=nuisances(replicates, path.evaluation) if in_sample is None else levels_of(in_sample),
+        nuisances=nuisances(replicates, path.evaluation) if last.in_sample is None else levels_of(last.in_sample),
         steps=path.steps,
         setup=notes.setup,
         unexplained=unexplained_by(path) if remains else [],
-        ladder=[rung.row for rung in rungs],
+        ladder=[rung.row for rung in last.rungs],
         advice=notes.advice,
         excluded=excluded,
         invisible=invisible,
@@ -150,7 +155,7 @@ def answer(
         dark=replicates.dark,
         crop=str(replicates.start.window) if replicates.start.window else None,
         untried=path.scan.untried,
-        in_sample=in_sample,
+        in_sample=last.in_sample,
         finished=path.finished,
         shape=replicates.start.layout.shape,
     )
@@ -190,10 +195,14 @@ def rival_step(path: ModelPath, rival: Trial) -> Step:
     """A change of the sensor that explains the totals as well as the set-up does, as a step."""
     coordinate = rival.candidate.strengths[0]
     low, high = rival.intervals.get(coordinate.key, (None, None))
-    value = Value(float(rival.values[coordinate.key]), low, high, coordinate.unit)
+    value = Value(value=float(rival.values[coordinate.key]), low=low, high=high, unit=coordinate.unit)
     left = mean_misfit(path.evaluation.replicate_residuals, rival.residuals or path.evaluation.residuals)
     return Step(
-        rival.candidate, {coordinate.parameter: value}, left, math.sqrt(max(rival.fall, 0.0)), "all rates alike"
+        candidate=rival.candidate,
+        values={coordinate.parameter: value},
+        misfit=left,
+        significance=math.sqrt(max(rival.fall, 0.0)),
+        material="all rates alike",
     )
 
 

@@ -131,7 +131,16 @@ def coordinate_of(effect: str, declared: Parameter, off: float | None) -> Coordi
     """
     assert declared.search is not None
     low, high = map(float, declared.search)
-    return Coordinate(effect, declared.name, declared.unit, low, high, off, declared.kind, declared.bounds)
+    return Coordinate(
+        effect=effect,
+        parameter=declared.name,
+        unit=declared.unit,
+        low=low,
+        high=high,
+        off=off,
+        kind=declared.kind,
+        bounds=declared.bounds,
+    )
 
 
 def point_of(coordinates: Sequence[Coordinate], values: Mapping[Key, Any]) -> np.ndarray:

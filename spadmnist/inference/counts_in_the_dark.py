@@ -160,7 +160,13 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
     mean = max(float(np.mean(means)), _LEAST_MEAN)
     spread = float(np.mean(variances)) / np.size(variances) / mean**2
     p_of_totals = float(stats.chi2.sf(float(np.square(scores).sum()), len(scores)))
-    return _Judged(float(np.mean(squares)) / mean, float(np.mean(totals)), float(np.mean(excess)), spread, p_of_totals)
+    return _Judged(
+        misfit=float(np.mean(squares)) / mean,
+        mean_rate=float(np.mean(totals)),
+        map=float(np.mean(excess)),
+        variance=spread,
+        p_of_totals=p_of_totals,
+    )
 
 
 def _answer(
@@ -188,7 +194,13 @@ def _answer(
     right = "explained" if start.p_value() < _SURE else "adequate"
     mean = float(np.mean(map_.values())) / max(float(np.mean(_listed(replicates.start, candidate))), 1e-300)
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
-    step = Step(candidate, results, found.misfit, start.significance(), f"mean of the map {100 * (mean - 1):+.2f} %")
+    step = Step(
+        candidate=candidate,
+        values=results,
+        misfit=found.misfit,
+        significance=start.significance(),
+        material=f"mean of the map {100 * (mean - 1):+.2f} %",
+    )
     step.map = map_
     return Diagnosis(
         sensor=replicates.start.name,

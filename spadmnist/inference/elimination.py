@@ -24,7 +24,7 @@ from .joint_fit import LOST, RISEN, SAME, WORTH, fit_all, informing, rise_of, wi
 from .levels import CLEARLY, LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
-from .replicates import FEW, TOTALS, CannotSimulate, Cell
+from .replicates import TOTALS, CannotSimulate, Cell
 from .results import Step, title
 from .signature import residuals_at, signatures
 from .trial_fits import fit_trial
@@ -67,7 +67,7 @@ def drop_needless(path: ModelPath) -> None:
         sensors = Model.same(replicates.start).changed(rest, path.scan.phases, chips)
         if any(s.candidate.carrier for s in path.steps):
             continue  # a map would have to be fitted anew
-        (signature,) = signatures(replicates, path.evaluation, [sensors], FEW)
+        (signature,) = signatures(replicates, path.evaluation, [sensors])
         if isinstance(signature, CannotSimulate):
             continue
         others = tuple(d for s in path.steps if s is not step for d in s.coordinates)

@@ -157,4 +157,11 @@ def placebo_of(
     errors = physical_errors(replicates, evaluation, residuals, one.signature.at(times))
     values = one.scaled() if times else {}
     misfit = mean_misfit(evaluation.replicate_residuals, residuals)
-    return Rung(f"placebo: {title(one.candidate)}", evaluation, misfit, errors, residuals, placebo=values)
+    return Rung(
+        model=f"placebo: {title(one.candidate)}",
+        evaluation=evaluation,
+        misfit=misfit,
+        errors=errors,
+        left=residuals,
+        placebo=values,
+    )

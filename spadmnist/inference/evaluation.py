@@ -106,7 +106,7 @@ class Evaluation:
             cell: (capture, statistic).
             total: detections of the capture.
         """
-        return self.once(("usual", cell, total), lambda: self.nulls[cell].expected(total))
+        return self.once(("expected", cell, total), lambda: self.nulls[cell].expected(total))
 
     def without_replicates(self) -> Evaluation:
         """The evaluation of a model from which the search has gone on: without its replicates and null distributions.
@@ -173,7 +173,18 @@ def _evaluate(
     about, wanted, entries = {}, [], dict[str, str | None]()
     before = {id: made for id, made in known.made.items() if id not in known.borrowed} if known else {}
     same = _same_level(replicates, sensors, n, *near) if near else {}
-    evaluation = Evaluation(dict(values), sensors, {}, {}, {}, {}, {}, {}, {}, borrowed=frozenset(same))
+    evaluation = Evaluation(
+        values=dict(values),
+        sensors=sensors,
+        made={},
+        nulls={},
+        rates={},
+        factors={},
+        residuals={},
+        replicate_residuals={},
+        judgements={},
+        borrowed=frozenset(same),
+    )
     centres = _centres(replicates, sensors, same)
     for id, seen in replicates.seen.items():
         if seen.counts is None:
@@ -210,14 +221,16 @@ def _evaluate(
         evaluation.made[id] = made
         law, scatter = law_of(made.totals, np.array([expected(float(centre * f)) for f in factors]))
         most = most_detections(replicates.seen[id].counted, sensors.one.layout.pixels)
-        evaluation.rates[id] = CaptureNull(centre, stated, made.totals, expected, law, scatter, most)
+        evaluation.rates[id] = CaptureNull(
+            level=centre, stated=stated, totals=made.totals, expected=expected, law=law, scatter=scatter, most=most
+        )
         evaluation.factors[id] = factors
         for name, summary in replicates.seen[id].summaries.items():
             if name not in made.values:
                 continue
             kind, scale = made.laws[name]
-            own = [Summary(v, kind, str, no_size, scale) for v in made.values[name]]
-            null = learn(own, made.totals, summary.contrasts)
+            summaries = [Summary(v, kind, str, no_size, scale) for v in made.values[name]]
+            null = learn(summaries, made.totals, summary.contrasts)
             cell = id, name
             evaluation.nulls[cell] = null
             evaluation.judgements[cell] = judged = null.judge(summary.values, replicates.seen[id].total)
@@ -241,9 +254,13 @@ def _compare_totals(replicates: Replicates, evaluation: Evaluation, number: int)
 
 def with_totals_anew(replicates: Replicates, evaluation: Evaluation) -> Evaluation:
     """The evaluation with its totals compared anew, where `Replicates.unstated` has changed."""
-    residuals, own = dict(evaluation.residuals), dict(evaluation.replicate_residuals)
-    again = replace(evaluation, residuals=residuals, replicate_residuals=own, space=None)
-    _compare_totals(replicates, again, len(own[TOTALS]))
+    again = replace(
+        evaluation,
+        residuals=dict(evaluation.residuals),
+        replicate_residuals=dict(evaluation.replicate_residuals),
+        space=None,
+    )
+    _compare_totals(replicates, again, len(again.replicate_residuals[TOTALS]))
     return again
 
 
@@ -365,7 +382,7 @@ def log_likelihood_ratio(evaluation: Evaluation, other: Evaluation, template: Ma
         null, new = evaluation.nulls[cell], other.nulls[cell]
         fall, wider = null.law.likelihood_ratio(z, there, (null.breadth, new.breadth), (null.factor, new.factor))
         wider = np.broadcast_to(wider, z.shape)
-        error = null.law.error_of_scatter(z.size, min(len(null.own), len(new.own)))
+        error = null.law.error_of_scatter(z.size, min(len(null.replicate_squares), len(new.replicate_squares)))
         moved = (template[cell] != 0) & (float(template[cell] @ template[cell]) > _MOVED)
         other_scatter = np.abs(wider) > _OTHER_SCATTER * error
         # a cell that never varies has no scatter: the log of its ratio is bounded
@@ -386,39 +403,39 @@ def stacked(blocks: Mapping[Cell, np.ndarray], keys: Sequence[Cell]) -> np.ndarr
     return np.concatenate([blocks[k] for k in keys]) if keys else np.zeros(0)
 
 
-def misfits(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
+def misfits(replicate_residuals: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> dict[Cell, float]:
     """The mean squared residual of each block, relative to that of the model's replicates.
 
     Args:
-        own: (replicates, cells) residuals of the replicates, by block.
+        replicate_residuals: (replicates, cells) residuals of the replicates, by block.
         residuals: (cells,) by block.
     """
     return {
-        cell: float(np.mean(z**2)) / max(float(np.mean(own[cell] ** 2)), 0.05)
+        cell: float(np.mean(z**2)) / max(float(np.mean(replicate_residuals[cell] ** 2)), 0.05)
         for cell, z in residuals.items()
         if cell != TOTALS and len(z)
     }
 
 
-def mean_misfit(own: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> float:
+def mean_misfit(replicate_residuals: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]) -> float:
     """The mean misfit over the blocks; where only means were measured, that of the totals.
 
     Args:
-        own, residuals: as in `misfits`.
+        replicate_residuals, residuals: as in `misfits`.
     """
-    all_ = list(misfits(own, residuals).values())
+    all_ = list(misfits(replicate_residuals, residuals).values())
     if not all_ and len(residuals[TOTALS]):
         return float(np.mean(residuals[TOTALS] ** 2))
     return float(np.mean(all_)) if all_ else 1.0
 
 
-def misfit_null_95(own: Mapping[Cell, np.ndarray]) -> float:
+def misfit_null_95(replicate_residuals: Mapping[Cell, np.ndarray]) -> float:
     """The 95 % quantile of the mean misfit under the null.
 
     Args:
-        own: (replicates, cells) residuals of the replicates, by block; the number that all blocks have is used.
+        replicate_residuals: as in `misfits`; the number of replicates that all blocks have is used.
     """
-    squares = [np.mean(z**2, axis=1) for cell, z in own.items() if cell != TOTALS]
+    squares = [np.mean(z**2, axis=1) for cell, z in replicate_residuals.items() if cell != TOTALS]
     if not squares:
         return 1.2
     n = min(map(len, squares))
@@ -461,7 +478,8 @@ def block_checks(
     for cell, z in residuals.items():
         if cell == TOTALS:
             out += [
-                BlockCheck(("", f"rate {k}"), float(2 * stats.norm.sf(abs(v))), k, float(v)) for k, v in enumerate(z)
+                BlockCheck(cell=("", f"rate {k}"), p=float(2 * stats.norm.sf(abs(v))), worst=k, z=float(v))
+                for k, v in enumerate(z)
             ]
         else:
             alone[cell] = evaluation.nulls[cell].p_value(z)
@@ -472,10 +490,10 @@ def block_checks(
         here = several.get(cell, [])
         least, tests = min(here, key=lambda check: check.p, default=None), 1 + len(here)
         if least is not None and least.p < p:
-            out.append(BlockCheck(cell, least.p, least.worst, least.z, tests, least))
+            out.append(BlockCheck(cell=cell, p=least.p, worst=least.worst, z=least.z, tests=tests, together=least))
         else:
-            out.append(BlockCheck(cell, p, worst, float(residuals[cell][worst]), tests))
-    out += [BlockCheck(cell, 1e-12, 0, 40.0) for cell in evaluation.exact]
+            out.append(BlockCheck(cell=cell, p=p, worst=worst, z=float(residuals[cell][worst]), tests=tests))
+    out += [BlockCheck(cell=cell, p=1e-12, worst=0, z=40.0) for cell in evaluation.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))
 
 

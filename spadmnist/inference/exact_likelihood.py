@@ -346,5 +346,9 @@ def _maximum(
     # of some coordinates the value falls as they rise
     spread = np.sqrt(np.diag(inverse)) * [-1.0 if d.lacks else 1.0 for d in coordinates]
     return MaximumLikelihood(
-        {**fixed, **found}, intervals, likelihood_ratios, tuple(found), inverse / np.outer(spread, spread)
+        values={**fixed, **found},
+        intervals=intervals,
+        likelihood_ratios=likelihood_ratios,
+        free=tuple(found),
+        correlations=inverse / np.outer(spread, spread),
     )

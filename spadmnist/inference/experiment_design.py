@@ -20,11 +20,11 @@ from .evaluation import Evaluation, evaluate, square
 from .light_levels import level_error
 from .models import InTheDark, Model
 from .reduction import ReducedCapture
-from .replicates import FEW, CannotSimulate, Replicates, simulated
+from .replicates import CannotSimulate, Replicates, simulated
 from .results import NONLINEARITY, Step, plain
 from .scan import Scan
 from .setups import SetupExplanation
-from .signature import signatures, template_of
+from .signature import Sampling, signatures, template_of
 from .trial import Trial
 
 # They decide which captures are advised, and how long the advice takes. All are rules of thumb: no measurement that is
@@ -127,7 +127,9 @@ def expected_significance(
 
     def there(sensors: Model) -> Model:
         typical = (lambda id: sensors.mean_sensor(like)) if sensors.typical else None
-        return Model(lambda id, number: sensors.of(like, number), sensors.one, sensors.alike, typical)
+        return Model(
+            of=lambda id, number: sensors.of(like, number), one=sensors.one, alike=sensors.alike, typical=typical
+        )
 
     first, second = there(known.sensors), there(other)
     stated = twin.photons_at(capture, replicates.start.layout)
@@ -139,7 +141,7 @@ def expected_significance(
     made = made.beside(replicates.dead)
     new.seen = {capture.id: ReducedCapture.of(made)}
     evaluation = evaluate(new, {}, first, _RECORDINGS)
-    (signature,) = signatures(new, evaluation, [second], FEW, hasty=False, kept="sure")
+    (signature,) = signatures(new, evaluation, [second], Sampling(hasty=False, kept="sure"))
     if isinstance(signature, CannotSimulate):
         return 0.0
     return math.sqrt(sum(float(t @ t) for t in template_of(new, evaluation, signature).values()))

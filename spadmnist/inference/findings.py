@@ -81,7 +81,15 @@ def _failed(
     if id == "":
         ids, *_ = totals_space(replicates, evaluation)
         which = ids[block.worst] if block.worst < len(ids) else None
-        return Deviation("rate", which, block.z**2, 0, "all pixels", 0.0, np.zeros(0)), ""
+        return Deviation(
+            statistic="rate",
+            capture=which,
+            excess=block.z**2,
+            worst=0,
+            where="all pixels",
+            size=0.0,
+            residuals=np.zeros(0),
+        ), ""
     cell = block.shown
     id, seen = cell[0], replicates.seen[cell[0]]
     summary, z = seen.summaries[name], residuals.get(cell, np.zeros(0))
@@ -91,7 +99,16 @@ def _failed(
     beyond = excess(summary, expected, z) if z.size else block.z**2
     if block.together is not None:
         beyond = max(beyond, block.together.excess)
-    return Deviation(name, id, beyond, block.worst, summary.where(block.worst), relative, z, at), text
+    return Deviation(
+        statistic=name,
+        capture=id,
+        excess=beyond,
+        worst=block.worst,
+        where=summary.where(block.worst),
+        size=relative,
+        residuals=z,
+        at=at,
+    ), text
 
 
 def _words(block: BlockCheck) -> str:
@@ -130,19 +147,19 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: S
             moved = [float(np.sum(step.template.get((id, name), np.zeros(1)) ** 2)) for step in steps]
             out.append(
                 Trace(
-                    name,
-                    id,
-                    replicates.seen[id].summaries[name],
-                    start.nulls[id, name].expected(total)[0],
-                    now,
-                    null.spread_at(now),
-                    start.residuals[id, name],
-                    last.residuals[id, name],
-                    one.where + _words(failed[i]),
-                    size,
-                    number,
-                    i == members[0],
-                    int(np.argmax(moved)) if moved and max(moved) > _MOVED else None,
+                    statistic=name,
+                    capture=id,
+                    summary=replicates.seen[id].summaries[name],
+                    before=start.nulls[id, name].expected(total)[0],
+                    after=now,
+                    spread=null.spread_at(now),
+                    residuals_before=start.residuals[id, name],
+                    residuals_after=last.residuals[id, name],
+                    where=one.where + _words(failed[i]),
+                    size=size,
+                    deviation=number,
+                    first=i == members[0],
+                    step=int(np.argmax(moved)) if moved and max(moved) > _MOVED else None,
                 )
             )
     return out

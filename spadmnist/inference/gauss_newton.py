@@ -14,7 +14,7 @@ from .evaluation import Evaluation, stacked
 from .levels import FALL_95, HALF_95
 from .models import Model
 from .replicates import FEW, CannotSimulate, Cell, Replicates
-from .signature import residuals_at, signatures
+from .signature import Sampling, residuals_at, signatures
 
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
 # of a logarithm: the step to both sides for a column of the Jacobian, the longest one; known errors make it shorter
@@ -116,8 +116,8 @@ def gauss_newton(
 
     def evaluate(points: Sequence[np.ndarray]) -> list[np.ndarray | CannotSimulate]:
         models = [sensors_of(boosted(at(u))) for u in points]
-        names = [effort.names] * len(points)
-        found = signatures(replicates, evaluation, models, effort.few, effort.only, names_of=names)
+        sampling = Sampling(few=effort.few, only=effort.only, names=effort.names)
+        found = signatures(replicates, evaluation, models, sampling)
         times = factor ** -effort.stronger[1]
         return [
             m if isinstance(m, CannotSimulate) else stacked(residuals_at(replicates, evaluation, m, times), keys)
@@ -131,7 +131,7 @@ def gauss_newton(
         return {**values, **up}
 
     u = point_of(coordinates, values)
-    own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)  # (replicates, cells)
+    replicate_residuals = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
     steps = np.array([0.25 if d.log else max(0.05 * (d.high - d.low), 0.02) for d in coordinates])
     best: tuple[float, np.ndarray, np.ndarray] | None = None
     begun, noise = 0.0, 0.0 if effort.thorough else _NOISE * max(len(coordinates) - 1, 0)
@@ -173,7 +173,7 @@ def gauss_newton(
         step = step * min(1.0, float(np.min(limit / np.maximum(np.abs(step), 1e-12))))
         u = np.array([d.coordinate(d.value(float(x))) for d, x in zip(coordinates, u0 + step, strict=True)])
         promised = float(cost - ((z + jacobian @ (u - u0)) ** 2).sum())
-        error = np.sqrt(np.maximum(np.diag(covariance_of(jacobian, own)), 1e-30))
+        error = np.sqrt(np.maximum(np.diag(covariance_of(jacobian, replicate_residuals)), 1e-30))
         # never so short that the threshold for noise appears as a derivative
         steps = np.clip(8 * error, [0.1 if d.log else 0.02 * (d.high - d.low) for d in coordinates], 0.5)
         begun = cost if turn == 0 else begun
@@ -185,13 +185,13 @@ def gauss_newton(
     assert best is not None
     cost, u, z = best
     return Fit(
-        coordinates,
-        u,
-        covariance_of(jacobian, own),
-        _split(z, evaluation, keys),
-        _split(jacobian, evaluation, keys),
-        cost,
-        at(u),
+        coordinates=coordinates,
+        point=u,
+        covariance=covariance_of(jacobian, replicate_residuals),
+        residuals=_split(z, evaluation, keys),
+        jacobian=_split(jacobian, evaluation, keys),
+        square=cost,
+        values=at(u),
     )
 
 
@@ -283,13 +283,13 @@ def gauss_newton_step(
     coordinates, by = tuple(coordinates), by or JacobianBy()
     keys = list(evaluation.residuals)
     z, u = stacked(evaluation.residuals, keys), point_of(coordinates, values)
-    own = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
+    replicate_residuals = np.concatenate([evaluation.replicate_residuals[k] for k in keys], axis=1)
     if by.before is not None and by.before.coordinates == coordinates:
         columns = [stacked(column_of(by.before, i, evaluation), keys) for i in range(len(coordinates))]
         jacobian = np.stack(columns, axis=1)
     else:
         jacobian = _jacobian(replicates, evaluation, coordinates, u, sensors_of, by)
-    covariance = covariance_of(jacobian, own)
+    covariance = covariance_of(jacobian, replicate_residuals)
     error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
     step = -np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10) @ (jacobian.T @ z)
     # a coordinate that is not informed stays
@@ -298,13 +298,13 @@ def gauss_newton_step(
     left = z + jacobian @ (point - u)
     new = {**values, **{d.key: d.value(float(x)) for d, x in zip(coordinates, point, strict=True)}}
     return Fit(
-        coordinates,
-        point,
-        covariance,
-        _split(left, evaluation, keys),
-        _split(jacobian, evaluation, keys),
-        float(left @ left),
-        new,
+        coordinates=coordinates,
+        point=point,
+        covariance=covariance,
+        residuals=_split(left, evaluation, keys),
+        jacobian=_split(jacobian, evaluation, keys),
+        square=float(left @ left),
+        values=new,
     )
 
 
@@ -342,8 +342,7 @@ def _jacobian(
             replicates,
             evaluation,
             [sensors_of(values_there[k]) for k in some],
-            by.few,
-            kept="all" if bare else "likely",
+            Sampling(few=by.few, kept="all" if bare else "likely"),
             only_of=[only[k // 2] for k in some],
         )
         for k, m in zip(some, made, strict=True):
@@ -365,8 +364,8 @@ def column_of(fit: Fit, i: int, evaluation: Evaluation) -> dict[Cell, np.ndarray
 def _column(slope: Mapping[Cell, np.ndarray], evaluation: Evaluation) -> dict[Cell, np.ndarray]:
     out = {}
     for key, residuals in evaluation.residuals.items():
-        own = slope.get(key)
-        out[key] = own if own is not None and len(own) == len(residuals) else np.zeros(len(residuals))
+        column = slope.get(key)
+        out[key] = column if column is not None and len(column) == len(residuals) else np.zeros(len(residuals))
     return out
 
 
@@ -399,7 +398,7 @@ def profile_intervals(
         return fit.coordinates[i].coordinate(fit.coordinates[i].value(u))
 
     def squares(models: Sequence[Model]) -> np.ndarray:
-        keys, found = list(evaluation.residuals), signatures(replicates, evaluation, models, few)
+        keys, found = list(evaluation.residuals), signatures(replicates, evaluation, models, Sampling(few=few))
         z = [
             np.full(1, math.nan)
             if isinstance(m, CannotSimulate)
@@ -423,7 +422,7 @@ def profile_intervals(
     }
 
 
-def covariance_of(jacobian: np.ndarray, own: np.ndarray) -> np.ndarray:
+def covariance_of(jacobian: np.ndarray, replicate_residuals: np.ndarray) -> np.ndarray:
     """The covariance of the least-squares estimate (sandwich), (coordinates, coordinates).
 
     The cells scatter as they do in the model's replicates. A coordinate that is not informed has an infinite
@@ -431,11 +430,11 @@ def covariance_of(jacobian: np.ndarray, own: np.ndarray) -> np.ndarray:
 
     Args:
         jacobian: (cells, coordinates).
-        own: (replicates, cells) residuals.
+        replicate_residuals: (replicates, cells) residuals.
     """
     solve = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10) @ jacobian.T
-    estimates = own @ solve.T
-    n = len(own)
+    estimates = replicate_residuals @ solve.T
+    n = len(replicate_residuals)
     # a little wider, for the finite number of replicates
     covariance = np.atleast_2d(np.cov(estimates.T)) * (n + 2) / max(n - 2, 1)
     blind = np.einsum("ij,ij->j", jacobian, jacobian) < _BLIND
@@ -453,7 +452,7 @@ def error_scale(fit: Fit, evaluation: Evaluation) -> np.ndarray:
     Args:
         evaluation: its replicates give the scatter.
     """
-    keys = [k for k, own in evaluation.replicate_residuals.items() if len(fit.jacobian.get(k, ())) == own.shape[1]]
+    keys = [k for k, z in evaluation.replicate_residuals.items() if len(fit.jacobian.get(k, ())) == z.shape[1]]
     if not keys:
         return np.ones(len(fit.coordinates))
     jacobian, z = np.concatenate([fit.jacobian[k] for k in keys]), stacked(fit.residuals, keys)

@@ -16,7 +16,7 @@ from .joint_fit import fit_all, model_of
 from .model_path import ModelPath, keys_of
 from .replicates import FEW, CannotSimulate
 from .results import Value
-from .signature import IGNORED, captures_showing, residuals_at, signatures
+from .signature import IGNORED, Sampling, captures_showing, residuals_at, signatures
 from .trial_fits import EXCLUDED
 
 # standard deviations: a larger move of a coordinate by the exact likelihood needs another evaluation; a rule of thumb
@@ -63,7 +63,9 @@ def sharpen(path: ModelPath, measurement: Measurement) -> None:
                 abs(coordinate.coordinate(value) - coordinate.coordinate(start[coordinate.key]))
                 / errors[coordinate.key],
             )
-            step.values[coordinate.parameter] = Value(value, low, high, coordinate.unit, "likelihood")
+            step.values[coordinate.parameter] = Value(
+                value=value, low=low, high=high, unit=coordinate.unit, method="likelihood"
+            )
             path.values[coordinate.key] = value
     if largest_move > _MOVED:
         path.evaluation = evaluate(replicates, path.values, model_of(path)[0])
@@ -156,7 +158,7 @@ def open_ends(path: ModelPath) -> None:
     some = [captures_showing(step.template, IGNORED[0]) for step, _, _ in tests]
     now = square(evaluation.residuals)
     for (step, coordinate, end), signature in zip(
-        tests, signatures(replicates, evaluation, models, 2 * FEW, only_of=some), strict=True
+        tests, signatures(replicates, evaluation, models, Sampling(few=2 * FEW), only_of=some), strict=True
     ):
         if isinstance(signature, CannotSimulate):
             continue

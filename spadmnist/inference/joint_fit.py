@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,7 @@ from .models import Model
 from .pixel_maps import map_values
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
 from .results import Step, Value
-from .signature import IGNORED, captures_showing, residuals_at, signatures
+from .signature import IGNORED, Sampling, captures_showing, residuals_at, signatures
 
 if TYPE_CHECKING:
     from .model_path import ModelPath
@@ -81,9 +81,13 @@ def fit_all(
     found: Fit | None = None
     path.approximate = False
     if coordinates:
-        known_columns = _side_by_side(evaluation, coordinates, columns)
-        given = evaluation, maps, coordinates, edge_errors(path, fit), known_columns, roughly, where_shown
-        found, evaluation, maps = repeated_steps(path, *given)
+        by = StepsBy(
+            errors=edge_errors(path, fit),
+            near=_side_by_side(evaluation, coordinates, columns),
+            roughly=roughly,
+            where_shown=where_shown,
+        )
+        found, evaluation, maps = repeated_steps(path, evaluation, maps, coordinates, by)
         found = found or (fit if fit is not None and fit.coordinates == coordinates else None)
     path.approximate = path.approximate or (roughly and bool(maps))
     path.evaluation = evaluation
@@ -155,7 +159,31 @@ def _side_by_side(evaluation: Evaluation, coordinates: tuple[Coordinate, ...], f
         columns.append(column_of(fit, fit.coordinates.index(coordinate), evaluation))
     jacobian = {cell: np.stack([column[cell] for column in columns], axis=1) for cell in evaluation.residuals}
     n = len(coordinates)
-    return Fit(coordinates, np.zeros(n), np.full((n, n), np.inf), {}, jacobian, math.inf, {})
+    return Fit(
+        coordinates=coordinates,
+        point=np.zeros(n),
+        covariance=np.full((n, n), np.inf),
+        residuals={},
+        jacobian=jacobian,
+        square=math.inf,
+        values={},
+    )
+
+
+@dataclass(frozen=True)
+class StepsBy:
+    """By what repeated steps find their Jacobians, and what they simulate again.
+
+    Attributes:
+        errors: standard deviations of coordinates, as in `JacobianBy`.
+        near: a fit whose Jacobian is taken at first.
+        roughly, where_shown: see `fit_all`.
+    """
+
+    errors: Mapping[Key, float] = field(default_factory=dict)
+    near: Fit | None = None
+    roughly: bool = False
+    where_shown: bool = False
 
 
 def repeated_steps(
@@ -163,20 +191,18 @@ def repeated_steps(
     evaluation: Evaluation,
     maps: dict[Key, pixel_maps.PixelMap],
     coordinates: tuple[Coordinate, ...],
-    errors: Mapping[Key, float],
-    near: Fit | None = None,
-    roughly: bool = False,
-    where_shown: bool = False,
+    by: StepsBy = StepsBy(),
 ) -> tuple[Fit | None, Evaluation, dict[Key, pixel_maps.PixelMap]]:
     """(fit of all coordinates, evaluation of the model, its maps), from values near the best ones.
 
     The fit is None where the model cannot be simulated around them.
 
     Args:
-        near: a fit whose Jacobian is taken at first.
-        roughly, where_shown: see `fit_all`.
+        evaluation, maps: of the model at the start.
+        coordinates: what is fitted.
     """
     replicates, known = path.replicates, _known_jacobian(path)
+    near, roughly = by.near, by.roughly
     fit: Fit | None = None
     rejected: Fit | None = None  # by known columns, at the values from which they led nowhere
     path.approximate = near is not None
@@ -186,10 +212,10 @@ def repeated_steps(
         turn += 1
         here = {d.key: path.values[d.key] for d in coordinates}
         try:
-            only = functools.partial(_shown, path) if where_shown else lambda key: ()
-            by = JacobianBy(_recordings(evaluation), errors, known, near, only)
+            only = functools.partial(_shown, path) if by.where_shown else lambda key: ()
+            jacobian_by = JacobianBy(few=_recordings(evaluation), errors=by.errors, known=known, before=near, only=only)
             model = functools.partial(path.model_at, evaluation)
-            closer = gauss_newton_step(replicates, evaluation, coordinates, here, model, by)
+            closer = gauss_newton_step(replicates, evaluation, coordinates, here, model, jacobian_by)
         except CannotSimulate as error:
             path.no_fit_because = str(error)
             path.approximate = path.approximate or borrowed_columns
@@ -282,9 +308,9 @@ def rise_of(before: Evaluation, after: Evaluation, keys: Sequence[Cell]) -> tupl
     if not keys:
         return 0.0, 0.0
     rise = square({k: after.residuals[k] for k in keys}) - square({k: before.residuals[k] for k in keys})
-    own = np.concatenate([before.replicate_residuals[k] for k in keys], axis=1)
-    projection = own @ stacked(before.residuals, keys)
-    variance = 1 / len(own) + 1 / len(after.replicate_residuals[keys[0]])
+    replicate_residuals = np.concatenate([before.replicate_residuals[k] for k in keys], axis=1)
+    projection = replicate_residuals @ stacked(before.residuals, keys)
+    variance = 1 / len(replicate_residuals) + 1 / len(after.replicate_residuals[keys[0]])
     return rise, 2 * math.sqrt(variance) * float(np.std(projection))
 
 
@@ -300,7 +326,8 @@ def bounded(path: ModelPath, fit: Fit) -> Fit:
     """
     replicates, evaluation, coordinates = path.replicates, path.evaluation, fit.coordinates
     there = {d.key: d.value(float(x)) for d, x in zip(coordinates, fit.point, strict=True)}
-    (signature,) = signatures(replicates, evaluation, [path.model_at(evaluation, there)], _recordings(evaluation))
+    sampling = Sampling(few=_recordings(evaluation))
+    (signature,) = signatures(replicates, evaluation, [path.model_at(evaluation, there)], sampling)
     now = square(evaluation.residuals)
     if isinstance(signature, CannotSimulate) or square(residuals_at(replicates, evaluation, signature)) > now + LOST:
         return replace(fit, point=point_of(coordinates, path.values), residuals=evaluation.residuals)
@@ -323,8 +350,9 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
                     continue
                 variance = max(float(fit.covariance[i, i]), 0.0) + extra[k]
                 u, half = float(fit.point[i]), HALF_95 * math.sqrt(variance)
+                low, high = coordinate.interval(u - half, u + half)
                 step.values[coordinate.parameter] = Value(
-                    coordinate.value(u), *coordinate.interval(u - half, u + half), coordinate.unit
+                    value=coordinate.value(u), low=low, high=high, unit=coordinate.unit
                 )
                 path.values[coordinate.key] = coordinate.value(u)
     for step in path.steps:
@@ -338,7 +366,7 @@ def _write_values(path: ModelPath, fit: Fit | None, maps: Mapping[Key, pixel_map
                 # the interval for any value of a whole number; it is of no use where later steps have moved the value
                 inside = low <= own.value <= high
                 low, high = (min(low, own.low), max(high, own.high)) if inside else (own.low, own.high)
-            step.values[name] = Value(float(path.values[effect, name]), low, high, unit)
+            step.values[name] = Value(value=float(path.values[effect, name]), low=low, high=high, unit=unit)
         for (_, name), value in step.candidate.fixed:
             if name not in step.values and isinstance(value, (bool, int, float)):
                 step.values[name] = Value(float(value), None, None)

@@ -326,10 +326,10 @@ def whole_of(replicates: Replicates, id: str) -> str:
 def stated_levels(replicates: Replicates, evaluation: Evaluation) -> tuple[list[str], np.ndarray, np.ndarray]:
     """(captures whose level is stated and informed, elasticities (captures,), the light's part in the errors)."""
     ids = _stated(replicates, evaluation)
-    slopes = [evaluation.rates[id].level_of(max(replicates.seen[id].total, 1.0))[2] for id in ids]
+    elasticities = [evaluation.rates[id].level_of(max(replicates.seen[id].total, 1.0))[2] for id in ids]
     lights = [replicates.seen[id].capture.light for id in ids]
     common = np.array([0.0 if light.dark else light.relative_uncertainty for light in lights])
-    return ids, np.array([max(slope, 1e-3) for slope in slopes]), common
+    return ids, np.array([max(x, 1e-3) for x in elasticities]), common
 
 
 def level_error(replicates: Replicates, evaluation: Evaluation, id: str) -> float:

@@ -122,13 +122,15 @@ class _Fitted:
         assert candidate.carrier is not None
         declared = Effect.registry.find(candidate.carrier[0]).parameters[candidate.carrier[1]]
         base, group = base_of(start, candidate), groups_of(start, candidate.per)
+        low, high = bounds_of(candidate.carrier)
         size = int(group.max()) + 1
         return cls(
-            candidate,
-            base if base > 0 else float((declared.search or (1e-3, 1))[0]),
-            group,
-            *bounds_of(candidate.carrier),
-            acts_on_light(start, candidate),
+            candidate=candidate,
+            base=base if base > 0 else float((declared.search or (1e-3, 1))[0]),
+            group=group,
+            low=low,
+            high=high,
+            of_light=acts_on_light(start, candidate),
             logs=np.zeros(size),
             variance=np.ones(size),
             raw=np.zeros(size),
@@ -218,9 +220,19 @@ class _Fitted:
     def map(self, of_scene: bool) -> PixelMap:
         """The map as fitted."""
         assert self.candidate.carrier is not None
-        error = np.sqrt(np.maximum(self.variance, 0))
-        own = self.group, self.logs, error, self.raw, np.sqrt(self.raw_variance), self.sigma, self.low, self.high
-        return replace(PixelMap(self.candidate.carrier, self.base, *own), of_scene=of_scene)
+        return PixelMap(
+            carrier=self.candidate.carrier,
+            base=self.base,
+            group=self.group,
+            estimate=self.logs,
+            error=np.sqrt(np.maximum(self.variance, 0)),
+            raw=self.raw,
+            raw_error=np.sqrt(self.raw_variance),
+            sigma=self.sigma,
+            low=self.low,
+            high=self.high,
+            of_scene=of_scene,
+        )
 
 
 def width_of_most(raw: np.ndarray, noise: float) -> float:
@@ -485,7 +497,16 @@ def fit_codes(replicates: Replicates, candidate: Candidate, use: Sequence[str] =
         logs = np.log(np.maximum(1 + raw * share, 1e-3))
         error = np.full(period, math.sqrt(noise * share))
         spread = np.full(period, math.sqrt(noise))
-        found = PixelMap(candidate.carrier, 1.0, np.arange(period), logs, error, np.log1p(raw), spread, sigma)
+        found = PixelMap(
+            carrier=candidate.carrier,
+            base=1.0,
+            group=np.arange(period),
+            estimate=logs,
+            error=error,
+            raw=np.log1p(raw),
+            raw_error=spread,
+            sigma=sigma,
+        )
     if found is None:
         raise SpadError("no capture has stamps with codes")
     return found
@@ -517,6 +538,13 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
     raw, raw_error = mean_of(likely, grid)
     low, high = bounds_of(candidate.carrier)
     map_ = PixelMap(
-        candidate.carrier, base, groups_of(start, candidate.per), estimate, error, raw, raw_error, width.sigma
+        carrier=candidate.carrier,
+        base=base,
+        group=groups_of(start, candidate.per),
+        estimate=estimate,
+        error=error,
+        raw=raw,
+        raw_error=raw_error,
+        sigma=width.sigma,
     )
     return replace(map_, low=low, high=high, likely=(grid, weights), certain=0.0, width=width)

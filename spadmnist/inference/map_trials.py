@@ -83,7 +83,19 @@ def map_trials_of(
         if p > least:
             continue
         nothing = Signature({}, {}, {})
-        out.append(Trial(group[0], mapped, nothing, 0.0, 1.0, sensors, maps=found, more=tuple(group[1:]), p_value=p))
+        out.append(
+            Trial(
+                candidate=group[0],
+                values=mapped,
+                signature=nothing,
+                fall=0.0,
+                times=1.0,
+                sensors=sensors,
+                maps=found,
+                more=tuple(group[1:]),
+                p_value=p,
+            )
+        )
     return out
 
 
@@ -216,7 +228,15 @@ def random_map_trials(
                     continue
                 residuals = residuals_at(scan.replicates, evaluation, signature)
                 fall = square(evaluation.residuals) - square(residuals)
-                one = Trial(candidate, {}, signature, fall, 1.0, sensors, residuals=residuals)
+                one = Trial(
+                    candidate=candidate,
+                    values={},
+                    signature=signature,
+                    fall=fall,
+                    times=1.0,
+                    sensors=sensors,
+                    residuals=residuals,
+                )
                 one = scan._with_score(evaluation, one) if faint else one
                 if best is None or one.fall > best.fall:
                     best, about = one, float(sigma)

@@ -52,7 +52,9 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
     totals = mean * np.exp(apart + scatter * normal[order])
-    return CaptureNull(level, stated, totals, expected, (apart, 1.0), scatter), np.ones(replicates)
+    return CaptureNull(
+        level=level, stated=stated, totals=totals, expected=expected, law=(apart, 1.0), scatter=scatter
+    ), np.ones(replicates)
 
 
 def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:

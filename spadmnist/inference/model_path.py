@@ -147,10 +147,23 @@ class ModelPath:
         misfit = mean_misfit(self.evaluation.replicate_residuals, left)
         held = [c for c in self.scan.accepted if c.carrier]
         chips = any(step.chips for step in self.steps)
-        maps = HeldMaps(dict(self.values), held, dict(self.scan.phases), chips) if held else None
+        maps = (
+            HeldMaps(values=dict(self.values), held=held, phases=dict(self.scan.phases), chips=chips) if held else None
+        )
         for rung in self.ladder[1:]:
             rung.evaluation = rung.evaluation.without_replicates()
-        self.ladder.append(Rung(name, self.evaluation, misfit, errors, left, self.fit, list(steps), maps))
+        self.ladder.append(
+            Rung(
+                model=name,
+                evaluation=self.evaluation,
+                misfit=misfit,
+                errors=errors,
+                left=left,
+                fit=self.fit,
+                steps=list(steps),
+                maps=maps,
+            )
+        )
 
     @property
     def sensor_values(self) -> dict[Key, Any]:
@@ -204,7 +217,7 @@ def begin(replicates: Replicates) -> ModelPath:
     scan = Scan(replicates, replicates.say)
     evaluation, phases = evaluate_start(replicates)
     scan.phases.update(phases)
-    path = ModelPath(replicates, scan, evaluation, {}, [], [])
+    path = ModelPath(replicates=replicates, scan=scan, evaluation=evaluation, values={}, steps=[], ladder=[])
     path.rung("start")
     return path
 
@@ -219,11 +232,11 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
     roughly = not (best.fluctuates or before.fluctuates) and _moves_no_map(path, best)
     new = [
         Step(
-            candidate,
-            {},
-            0.0,
-            significance,
-            material(best),
+            candidate=candidate,
+            values={},
+            misfit=0.0,
+            significance=significance,
+            material=material(best),
             coordinates=best.fit.coordinates if best.fit is not None else (),
             jacobian=best.fit.jacobian if best.fit is not None and best.faint else {},
             template=template_of(replicates, before, best.there or best.signature),

@@ -22,7 +22,7 @@ from ..workers import Executor, executor
 from . import experiment_design, setups, time_blocks, upper_limits
 from .budget import FITS, STEPS, Budget, OutOfBudget, clock
 from .comparison import Comparison, comparison_of, comparison_with, nothing_to_compare
-from .conclusion import Limits, Notes, answer, left_over, outside, rival_step, so_far, too_short, verdict_of
+from .conclusion import LastLook, Limits, Notes, answer, left_over, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_needless, drop_unexplaining, no_step_explains
 from .error_budget import Rung
 from .evaluation import Evaluation, as_compared, block_checks, failing, misfit_null_95, with_totals_anew
@@ -194,7 +194,8 @@ def _diagnosed(
         in_sample = (
             comparison_of(replicates, own) if own else comparison_with(replicates, path.sensor_values, path.scan.phases)
         )
-    found = answer(path, start, notes, verdict, rungs, null_95, limits, in_sample)
+    last = LastLook(rungs=rungs, null_95=null_95, limits=limits, in_sample=in_sample)
+    found = answer(path, start, notes, verdict, last)
     found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None
     found.shared, found.bent = notes.shared, notes.bent
     found.faulty = notes.faulty if notes.explained else ""

@@ -54,10 +54,10 @@ class Model:
         """
         typical = self.typical
         return Model(
-            lambda capture, number: self.of(name_of(capture), number),
-            self.one,
-            self.alike,
-            None if typical is None else lambda capture: typical(name_of(capture)),
+            of=lambda capture, number: self.of(name_of(capture), number),
+            one=self.one,
+            alike=self.alike,
+            typical=None if typical is None else lambda capture: typical(name_of(capture)),
         )
 
     def changed(
@@ -91,12 +91,12 @@ class Model:
                 return changed(sensor, own(capture))
             return with_values(on_chip(sensor, number + 1) if chips else sensor, {**values, **own(capture)})
 
-        def usual(capture: str) -> Sensor:
+        @functools.lru_cache(maxsize=64)
+        def typical(capture: str) -> Sensor:
             return with_values(self.mean_sensor(capture), {**values, **own(capture)})
 
         alike = self.alike and not chips
-        typical = functools.lru_cache(maxsize=64)(usual) if self.typical or chips else None
-        return Model(of, changed(self.one, {}), alike, typical)
+        return Model(of=of, one=changed(self.one, {}), alike=alike, typical=typical if self.typical or chips else None)
 
 
 def phase_parameters(sensor: Sensor) -> list[Key]:

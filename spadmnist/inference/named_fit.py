@@ -214,8 +214,15 @@ def _by_likelihood(path: ModelPath, wanted: Sequence[Candidate], exact: MaximumL
         intervals = {d.key: exact.intervals[d.key] for d in candidate.coordinates}
         own = {**dict(candidate.fixed), **{key: exact.values[key] for key in intervals}}
         signature = signature_of_totals(replicates, before, before.sensors.changed(own))
-        change = material(Trial(candidate, own, signature, likelihood_ratio, 1.0))
-        step = Step(candidate, {}, 0.0, math.sqrt(max(likelihood_ratio, 0.0)), change, intervals=intervals)
+        change = material(Trial(candidate=candidate, values=own, signature=signature, fall=likelihood_ratio, times=1.0))
+        step = Step(
+            candidate=candidate,
+            values={},
+            misfit=0.0,
+            significance=math.sqrt(max(likelihood_ratio, 0.0)),
+            material=change,
+            intervals=intervals,
+        )
         step.template, step.before = template_of(replicates, before, signature), dict(before.residuals)
         path.steps.append(step)
     path.scan.accepted += wanted
@@ -238,7 +245,9 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
                 path.values,
                 count_model.light_levels_of(replicates, path.evaluation),
             )
-            best = Trial(candidate, {}, Signature({}, {}, {}), 0.0, 1.0, maps={}, p_value=p)
+            best = Trial(
+                candidate=candidate, values={}, signature=Signature({}, {}, {}), fall=0.0, times=1.0, maps={}, p_value=p
+            )
             accept(path, best, float(stats.norm.isf(max(p, LEAST_P) / 2)))
             continue
         best = fit_trial(replicates, path.evaluation, _started(path, candidate), 5)
@@ -295,7 +304,9 @@ def _kept(path: ModelPath, candidate: Candidate) -> None:
     values: dict[str, Value] = {}
     for (effect, name), _ in candidate.fixed:
         values[name] = Value(float(getattr(path.replicates.start.effect(effect), name)), None, None)
-    path.steps.append(Step(candidate, values, path.misfit, 0.0, "mean rate +0.00 %"))
+    path.steps.append(
+        Step(candidate=candidate, values=values, misfit=path.misfit, significance=0.0, material="mean rate +0.00 %")
+    )
     path.rung(f"{title(candidate)} as it was", path.steps[-1:])
 
 

@@ -63,7 +63,7 @@ class Null:
         recordings: number of replicates.
         factor: the factor by which standardized residuals are too large, from the replicates.
         tail: the same for the largest residuals.
-        own: (replicates,) mean squared residual of each replicate.
+        replicate_squares: (replicates,) mean squared residual of each replicate.
         reach: (least, most) total relative to `middle`, less 1, to which the regression is extrapolated.
         contrasts: (patterns, cells) of the summary, each of unit length, divided by its scatter in the replicates;
             None without any.
@@ -77,7 +77,7 @@ class Null:
     recordings: int
     factor: float
     tail: float
-    own: np.ndarray
+    replicate_squares: np.ndarray
     reach: tuple[float, float] = (-math.inf, math.inf)
     contrasts: np.ndarray | None = None
 
@@ -106,11 +106,20 @@ class Null:
             wrong = values != expected
             worst = int(np.argmax(wrong))
             p = 1e-12 if wrong.any() else 1.0
-            return Judgement(p, float(wrong.any()) * 1e3, np.where(wrong, 40.0, 0.0), expected, spread, worst)
+            return Judgement(
+                p_value=p,
+                misfit=float(wrong.any()) * 1e3,
+                residuals=np.where(wrong, 40.0, 0.0),
+                expected=expected,
+                spread=spread,
+                worst=worst,
+            )
         z = self.residuals(values, expected, leverage)
         p, worst = self.p_value(z)
-        mean = max(float(self.own.mean()), 0.05)
-        return Judgement(p, float(np.mean(z**2)) / mean, z, expected, spread, worst)
+        mean = max(float(self.replicate_squares.mean()), 0.05)
+        return Judgement(
+            p_value=p, misfit=float(np.mean(z**2)) / mean, residuals=z, expected=expected, spread=spread, worst=worst
+        )
 
     def p_value(self, z: np.ndarray) -> tuple[float, int]:
         """(p-value of residuals, the cell of the largest one).
@@ -137,8 +146,8 @@ class Null:
 
     def moments_of_squares(self, cells: int) -> tuple[float, float]:
         """(mean, variance) of the mean squared residual of so many cells."""
-        mean = max(float(self.own.mean()), 0.05)
-        variance = self.law.variance_of_squares(float(self.own.var(ddof=1)), cells)
+        mean = max(float(self.replicate_squares.mean()), 0.05)
+        variance = self.law.variance_of_squares(float(self.replicate_squares.var(ddof=1)), cells)
         return mean, variance * widening(self.recordings)
 
     def residuals(self, values: np.ndarray, expected: np.ndarray, leverage: float | np.ndarray) -> np.ndarray:
@@ -178,7 +187,17 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
         law = law_of("poisson", False)  # of this model it is a rare event: its light goes out, its frames repeat
     if law.exact:
         coefficients = np.median(values, axis=0, keepdims=True)
-        return Null(law, middle, coefficients, np.ones((1, 1)), np.zeros(values.shape[1]), n, 1.0, 1.0, np.zeros(n))
+        return Null(
+            law=law,
+            middle=middle,
+            coefficients=coefficients,
+            inverse=np.ones((1, 1)),
+            spread=np.zeros(values.shape[1]),
+            recordings=n,
+            factor=1.0,
+            tail=1.0,
+            replicate_squares=np.zeros(n),
+        )
     follows = law.terms > 1 and bool(np.ptp(x) > 0)
     design = _terms(x, law.terms if follows else 1)
     inverse = np.linalg.pinv(design.T @ design)
@@ -196,8 +215,20 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
     z = z / factor
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-    own, known = np.mean(z**2, axis=1), None if contrasts is None else in_scatters(contrasts, z)
-    return Null(law, middle, coefficients, inverse, spread, n, factor, tail_of(z), own, reach, known)
+    known = None if contrasts is None else in_scatters(contrasts, z)
+    return Null(
+        law=law,
+        middle=middle,
+        coefficients=coefficients,
+        inverse=inverse,
+        spread=spread,
+        recordings=n,
+        factor=factor,
+        tail=tail_of(z),
+        replicate_squares=np.mean(z**2, axis=1),
+        reach=reach,
+        contrasts=known,
+    )
 
 
 def in_scatters(contrasts: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -15,12 +15,14 @@ from .evaluation import Evaluation, evaluate
 from .light_levels import totals_space
 from .models import phase_parameters
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
-from .signature import Signature, residuals_at, residuals_shifted, signatures
+from .signature import Sampling, Signature, residuals_at, residuals_shifted, signatures
 from .spectral_lines import Line
 
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
-# factors on the simulated strength that are tried: at first, and about the best of these
+# factors on the simulated strength that are tried at first
 TIMES = (0.03, 0.1, 0.3, 0.6, 1.0, 1.7, 3.0, 6.0, 10.0)
+# factors on the best strength so far, pure numbers: a fifth apart, so that they decide the strength within 10 %. They
+# choose where a fit begins, in `scan`, too; a rule of thumb
 NEAR = (0.7, 0.85, 1.0, 1.2, 1.4)
 _NEARER = (0.92, 0.96, 1.04, 1.08)  # factors about the best of `NEAR`: they decide the strength within 4 %
 _PHASES = 24  # phases that are tried for each capture
@@ -123,7 +125,7 @@ def simulate_phases(
     turns = [2 * math.pi * k / _TURNS for k in range(_TURNS)]
     pairs = [(id, key) for id in replicates.seen for key in keys]
     models = [evaluation.sensors.changed(values, dict.fromkeys(pairs, turn)) for turn in turns]
-    found = signatures(replicates, evaluation, models, few, _lit(replicates))
+    found = signatures(replicates, evaluation, models, Sampling(few=few, only=_lit(replicates)))
     made: list[Signature] = []
     for one in found:
         if isinstance(one, CannotSimulate):
@@ -190,7 +192,7 @@ def choose_phase(
     pairs = [{(id, key): p for id, p in some.items() for key in keys} for some in (phases, mirrored)]
     left = []
     models = [evaluation.sensors.changed(values, some) for some in pairs]
-    for signature in signatures(replicates, evaluation, models, _MANY, _lit(replicates)):
+    for signature in signatures(replicates, evaluation, models, Sampling(few=_MANY, only=_lit(replicates))):
         if isinstance(signature, CannotSimulate):
             return dict(phases)
         squares = dict.fromkeys(phases, 0.0)
@@ -223,19 +225,19 @@ def _best(
         around: (phases,) rad to try, by capture.
     """
     ids, _, root, _ = totals_space(replicates, evaluation)
-    own = {cell: x for cell, x in swing.shifts.items() if cell in evaluation.residuals}
-    before = {cell: float(evaluation.residuals[cell] @ evaluation.residuals[cell]) for cell in own}
+    shifts = {cell: x for cell, x in swing.shifts.items() if cell in evaluation.residuals}
+    before = {cell: float(evaluation.residuals[cell] @ evaluation.residuals[cell]) for cell in shifts}
     rates = evaluation.residuals[TOTALS]
     best: tuple[float, float, dict[str, float]] | None = None
     for t in times:
         waves = {id: np.stack([_waves(t, float(p)) for p in phases]) for id, phases in around.items()}
-        gain = {id: np.zeros(len(phases)) for id, phases in around.items()}
-        for cell, x in own.items():
+        falls = {id: np.zeros(len(phases)) for id, phases in around.items()}
+        for cell, x in shifts.items():
             some = max(1, _AT_ONCE // x.shape[1])
             for k in range(0, len(waves[cell[0]]), some):
                 z = residuals_shifted(replicates, evaluation, cell, waves[cell[0]][k : k + some] @ x)
-                gain[cell[0]][k : k + some] += before[cell] - np.einsum("pc,pc->p", z, z)
-        chosen = {id: int(g.argmax()) for id, g in gain.items()}
+                falls[cell[0]][k : k + some] += before[cell] - np.einsum("pc,pc->p", z, z)
+        chosen = {id: int(fall.argmax()) for id, fall in falls.items()}
         logs = {id: waves[id] @ swing.logs.get(id, np.zeros(5)) for id in around}
 
         def of_totals(chosen: Mapping[str, int], logs: Mapping[str, np.ndarray] = logs) -> float:
@@ -244,9 +246,9 @@ def _best(
 
         for _ in range(3 if ids else 0):  # the totals share the light's common factor: one capture after the other
             for id in ids:
-                left = [gain[id][k] + of_totals({**chosen, id: k}) for k in range(len(gain[id]))]
+                left = [falls[id][k] + of_totals({**chosen, id: k}) for k in range(len(falls[id]))]
                 chosen[id] = int(np.argmax(left))
-        whole = of_totals(chosen) + sum(float(gain[id][k]) for id, k in chosen.items())
+        whole = of_totals(chosen) + sum(float(falls[id][k]) for id, k in chosen.items())
         if best is None or whole > best[0]:
             best = whole, t, {id: float(around[id][k]) % (2 * math.pi) for id, k in chosen.items()}
     assert best is not None

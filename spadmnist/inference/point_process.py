@@ -110,7 +110,7 @@ def followed_gaps(near, seen, pixel, stamps, out):
     Args:
         near: (gaps, kinds, offsets) of the gaps that may be short, as `Stamps.near` has them.
         seen: (counts, end): (pixels,) events; exposure, s.
-        pixel: (dead, chance, lifetime, rate): (pixels,) dead time, s; (traps, pixels) probability that a detection
+        pixel: (dead, probability, lifetime, rate): (pixels,) dead time, s; (traps, pixels) probability that a detection
             fills a trap; (traps,) s; (pixels,) 1/s, approximate, for the probability that a trap caused an event.
         stamps: (tick, sigma), s.
         out: (hazard, used): (gaps,) the hazard of traps at events, 1/s, from a pixel's offset on, the first `used`;
@@ -118,7 +118,7 @@ def followed_gaps(near, seen, pixel, stamps, out):
     """
     gaps, kinds, offsets = near
     counts, end = seen
-    dead, chance, lifetime, rate = pixel
+    dead, probability, lifetime, rate = pixel
     tick, sigma = stamps
     hazard, used = out
     pixels, traps = counts.size, lifetime.size
@@ -130,8 +130,8 @@ def followed_gaps(near, seen, pixel, stamps, out):
         used[i] = 0
         for k in range(traps):
             # full: probability that the last detection has filled the trap; old: the sum over those before
-            full[k] = chance[k, i]
-            emptied[k], blind[k] = math.log1p(-chance[k, i]), math.exp(-dead[i] / lifetime[k])
+            full[k] = probability[k, i]
+            emptied[k], blind[k] = math.log1p(-probability[k, i]), math.exp(-dead[i] / lifetime[k])
             base[i] += counts[i] * emptied[k]
             old[k] = 0.0
         none = 1.0  # a product, because logarithms are slow
@@ -228,11 +228,11 @@ def _at_best(hazard, offsets, used, counts, awake, rate):
         for _ in range(60):
             value, first, second = _of_rate(hazard, offsets[i], used[i], counts[i], awake[i], rate[i])
             step = first / second
-            gain = 0.5 * first * step  # of one more step
+            rise = 0.5 * first * step  # of one more step
             rate[i] = max(rate[i] + step, 0.2 * rate[i])
-            if gain < 1e-7:
+            if rise < 1e-7:
                 break
-        total += value + gain
+        total += value + rise
     return total
 
 
@@ -328,15 +328,15 @@ class Stamps:
         """
         dead = np.ascontiguousarray(np.broadcast_to(sensor.dead_times, len(self.counts)), np.float64)
         end = self.capture.conditions.exposure
-        chances = [(-np.expm1(-h), lifetime) for h, lifetime in hazards_of(sensor, len(dead)).values()]
-        filled = [(lifetime, p) for p, lifetime in chances if p.any()]
-        chance = np.array([p for _, p in filled]).reshape(len(filled), len(dead))
+        traps = [(-np.expm1(-h), lifetime) for h, lifetime in hazards_of(sensor, len(dead)).values()]
+        filled = [(lifetime, p) for p, lifetime in traps if p.any()]
+        probability = np.array([p for _, p in filled]).reshape(len(filled), len(dead))
         lifetime = np.array([x for x, _ in filled])
-        given = [dead, chance, lifetime, np.array([blur])]
+        given = [dead, probability, lifetime, np.array([blur])]
         if not (self.given and all(np.array_equal(a, b) for a, b in zip(given, self.given, strict=True))):
             self._look(float(dead.max(initial=0.0)) + max(_LONG * lifetime.max(initial=0.0), self.tick + 8 * blur))
             about = np.maximum(self.counts, 0.5) / np.maximum(end - self.counts * dead, 0.01 * end)
-            pixel = dead, chance, lifetime, about
+            pixel = dead, probability, lifetime, about
             out = self.hazard, self.used
             self.parts = np.array(followed_gaps(self.near, (self.counts, end), pixel, (self.tick, blur), out))
             self.given = given

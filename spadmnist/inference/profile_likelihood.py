@@ -157,7 +157,13 @@ def _parabola(
     # positive definite, although the coordinates may be strongly correlated
     root = np.sqrt(np.diag(curved))
     sizes, axes = np.linalg.eigh(curved / np.outer(root, root))
-    return Maximum(value, u, gradient, (axes * np.maximum(sizes, 0.01)) @ axes.T * np.outer(root, root), informed)
+    return Maximum(
+        value=value,
+        u=u,
+        jacobian=gradient,
+        curved=(axes * np.maximum(sizes, 0.01)) @ axes.T * np.outer(root, root),
+        informed=informed,
+    )
 
 
 def _move(gradient: np.ndarray, curved: np.ndarray, free: np.ndarray, u: np.ndarray, ends: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelih
 from .gauss_newton import Fit, JacobianBy, gauss_newton_step
 from .models import Model
 from .replicates import FEW, CannotSimulate, Replicates
-from .signature import IGNORED, captures_showing, residuals_at, signatures, template_of
+from .signature import IGNORED, Sampling, captures_showing, residuals_at, signatures, template_of
 from .trial import Trial
 
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
@@ -90,7 +90,7 @@ def fit_by_own_scatter(replicates: Replicates, evaluation: Evaluation, one: Tria
     if best is None:
         return one
     _, there, fit = best
-    (signature,) = signatures(replicates, evaluation, [there.sensors], only=some)
+    (signature,) = signatures(replicates, evaluation, [there.sensors], Sampling(only=some))
     if isinstance(signature, CannotSimulate):
         raise CannotSimulate(str(signature))
     residuals = residuals_at(replicates, evaluation, signature)

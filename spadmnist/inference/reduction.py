@@ -102,7 +102,17 @@ class ReducedCapture:
         capture = replace(recording.capture, tick=recording.tick)
         early = early_ticks(recording)
         total = total_of(recording, early)
-        return cls(capture, total, counts, summaries, last, waited, shortest, silence=silence, early=early)
+        return cls(
+            capture=capture,
+            total=total,
+            counts=counts,
+            summaries=summaries,
+            last=last,
+            waited=waited,
+            shortest=shortest,
+            silence=silence,
+            early=early,
+        )
 
 
 def early_ticks(recording: Recording) -> int | None:

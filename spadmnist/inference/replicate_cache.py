@@ -120,7 +120,7 @@ def unpacked(data: bytes) -> CaptureReplicates | None:
             at += arrays[name].nbytes
         laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts["laws"].items()}
         values = {statistic: arrays[f"values/{statistic}"].astype(np.float64, copy=False) for statistic in laws}
-        return CaptureReplicates(arrays["numbers"], arrays["totals"], values, laws)
+        return CaptureReplicates(numbers=arrays["numbers"], totals=arrays["totals"], values=values, laws=laws)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
         return None
 

@@ -82,7 +82,9 @@ class CaptureReplicates:
     def first(self, number: int) -> CaptureReplicates:
         """The first `number` replicates, or all of them where there are fewer."""
         values = {name: x[:number] for name, x in self.values.items()}
-        return CaptureReplicates(self.numbers[:number], self.totals[:number], values, self.laws)
+        return CaptureReplicates(
+            numbers=self.numbers[:number], totals=self.totals[:number], values=values, laws=self.laws
+        )
 
 
 @dataclass(frozen=True)
@@ -149,10 +151,10 @@ def _simulate(task: _Task) -> CaptureReplicates | CannotSimulate:
         return CannotSimulate.because(error)
     whole = {n: s for n, s in found.items() if len(s) == len(numbers)}
     return CaptureReplicates(
-        numbers,
-        np.array(totals, float),
-        {n: np.stack([one.values for one in s]).astype(np.float64) for n, s in whole.items()},
-        {
+        numbers=numbers,
+        totals=np.array(totals, float),
+        values={n: np.stack([one.values for one in s]).astype(np.float64) for n, s in whole.items()},
+        laws={
             n: (s[0].law, None if s[0].scale is None else np.mean([np.asarray(x.scale) for x in s[:_SCALES]], axis=0))
             for n, s in whole.items()
         },
@@ -212,7 +214,9 @@ class Replicates:
         self._reported: set[int] = set()  # numbers of workers that were reported
         for capture in measurement.captures:
             if capture.mean is not None:
-                self.seen[capture.id] = ReducedCapture(capture, capture.mean * sensor.layout.pixels, None, {})
+                self.seen[capture.id] = ReducedCapture(
+                    capture=capture, total=capture.mean * sensor.layout.pixels, counts=None, summaries={}
+                )
                 continue
             recording = self.recording(capture.id)
             total = float(recording.totals.sum())
@@ -340,9 +344,21 @@ class Replicates:
                 packed = [Packed.of(sensor, self.workers.apart) for sensor in sensors]
                 del sensors  # there may be many, with a map each
                 for part in parts:
-                    models = packed if model.alike else [packed[i] for i in part]
-                    rest = self.seed, self.dead, hasty, some_of[k], second, self.seen[id].early, cells
-                    tasks[k].append(_Task(models, capture, photons[part], numbers[part], *rest))
+                    tasks[k].append(
+                        _Task(
+                            models=packed if model.alike else [packed[i] for i in part],
+                            capture=capture,
+                            photons=photons[part],
+                            numbers=numbers[part],
+                            seed=self.seed,
+                            dead=self.dead,
+                            hasty=hasty,
+                            names=some_of[k],
+                            second=second,
+                            early=self.seen[id].early,
+                            cells=cells,
+                        )
+                    )
             except UNABLE as error:
                 tasks[k], out[k] = [], CannotSimulate.because(error)
         self.budget.spend(sum(work))
@@ -389,10 +405,10 @@ def joined(parts: Sequence[CaptureReplicates]) -> CaptureReplicates:
     """Replicates of one capture together: of the statistics that all of them have."""
     names = [name for name in parts[0].values if all(name in part.values for part in parts)]
     return CaptureReplicates(
-        np.concatenate([p.numbers for p in parts]),
-        np.concatenate([p.totals for p in parts]),
-        {name: np.concatenate([p.values[name] for p in parts]) for name in names},
-        {name: parts[0].laws[name] for name in names},
+        numbers=np.concatenate([p.numbers for p in parts]),
+        totals=np.concatenate([p.totals for p in parts]),
+        values={name: np.concatenate([p.values[name] for p in parts]) for name in names},
+        laws={name: parts[0].laws[name] for name in names},
     )
 
 

@@ -23,7 +23,16 @@ from .models import Model
 from .phases import NEAR, TIMES, PeriodicSignatures
 from .replicates import FEW, CannotSimulate, Replicates
 from .score_test import best_direction, sigmas_of
-from .signature import Signature, fall_of, odd_and_even, residuals_at, signature_of_totals, signatures, size_of
+from .signature import (
+    Sampling,
+    Signature,
+    fall_of,
+    odd_and_even,
+    residuals_at,
+    signature_of_totals,
+    signatures,
+    size_of,
+)
 from .spectral_lines import Line, spectral_lines
 from .trial import (
     BOLDER,
@@ -201,7 +210,17 @@ class Scan:
             with self.if_possible(candidate, _LOOKING, wholly=False):
                 chips = candidate.kind == "add" and has_random_pixels(with_values(evaluation.sensors.one, tried))
                 sensors = evaluation.sensors.changed(tried, chips=chips)
-                still.append(Trial(candidate, tried, Signature({}, {}, {}), 0.0, 1.0, sensors, chips=chips))
+                still.append(
+                    Trial(
+                        candidate=candidate,
+                        values=tried,
+                        signature=Signature({}, {}, {}),
+                        fall=0.0,
+                        times=1.0,
+                        sensors=sensors,
+                        chips=chips,
+                    )
+                )
         for one in self.simulated(evaluation, still, few, only):
             one.seen = set(only or evaluation.made)
             one.size = size_of(self.replicates, evaluation, one.signature)
@@ -220,7 +239,15 @@ class Scan:
             fall, times, found = swing.best_fit(self.replicates, evaluation)
             phases = {(id, key): p for id, p in found.items() for key in candidate.phases}
             fall -= 2 * len(phases)
-            one = Trial(candidate, tried, swing.at(found), fall, times, phases=phases, seen=set(evaluation.made))
+            one = Trial(
+                candidate=candidate,
+                values=tried,
+                signature=swing.at(found),
+                fall=fall,
+                times=times,
+                phases=phases,
+                seen=set(evaluation.made),
+            )
             for coordinate in frequencies_of(candidate):
                 f = float(tried[coordinate.key])
                 error = line.error if line else coordinate.high
@@ -250,7 +277,9 @@ class Scan:
                 if opposite := _opposite(evaluation, one):
                     down[i] = opposite
         models = [one.sensors for one in tried if one.sensors is not None]
-        made = signatures(self.replicates, evaluation, [*models, *down.values()], few, only, kept="sure")
+        made = signatures(
+            self.replicates, evaluation, [*models, *down.values()], Sampling(few=few, only=only, kept="sure")
+        )
         downs = dict(zip(down, made[len(tried) :], strict=True))
         out = []
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):
@@ -298,11 +327,11 @@ class Scan:
         for candidate, tried in tries:
             with self.if_possible(candidate, _LOOKING, wholly=False):
                 one = Trial(
-                    candidate,
-                    tried,
-                    signature_of_totals(self.replicates, evaluation, evaluation.sensors.changed(tried)),
-                    0.0,
-                    1.0,
+                    candidate=candidate,
+                    values=tried,
+                    signature=signature_of_totals(self.replicates, evaluation, evaluation.sensors.changed(tried)),
+                    fall=0.0,
+                    times=1.0,
                 )
                 one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
                 out.append(self._by_exact_totals(evaluation, one) if one.fall > PROMISING else one)

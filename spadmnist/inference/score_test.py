@@ -21,7 +21,7 @@ from .coordinates import Key
 from .evaluation import Evaluation, stacked
 from .levels import LEAST_P
 from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
-from .signature import Signature, signatures, template_of
+from .signature import Sampling, Signature, signatures, template_of
 from .spectral_lines import Line
 from .statistic_maps import p_of_width
 from .trial import Trial, shape_of
@@ -54,14 +54,14 @@ class ScoreTest:
     Attributes:
         size: the expected score of the whole signature.
         data: the score of the data.
-        own: (replicates,) the scores of the replicates.
+        replicates: (replicates,) the scores of the replicates.
         spread: their standard deviation, relative to that of independent cells.
         freedom: degrees of freedom of the t distribution of the score.
     """
 
     size: float
     data: float
-    own: np.ndarray
+    replicates: np.ndarray
     spread: float
     freedom: float
 
@@ -80,8 +80,8 @@ def p_of_any(
         values: the values of the model, SI.
         lines: the spectral lines of the data.
     """
-    data, own = p_values(replicates, evaluation, tried)
-    p = trials_corrected(own, min(data, default=1.0))
+    data, replicate_p_values = p_values(replicates, evaluation, tried)
+    p = trials_corrected(replicate_p_values, min(data, default=1.0))
     levels = count_model.light_levels_of(replicates, evaluation)
     maps = [
         p_of_map(replicates, evaluation, c, values, levels)
@@ -120,14 +120,14 @@ def p_of_best(
         others = sum(c.carrier is not None for c in replicates.candidates(evaluation.sensors.one)) if best.maps else 1
         return float(stats.norm.isf(max(best.p_value, LEAST_P) / 2)), min(1.0, best.p_value * max(others, 1))
     directions = [t for t in tried if _sided(best) and _family(t) == _family(best)]
-    _, own = p_values(replicates, evaluation, tried if directions else [best, *tried])
+    _, replicate_p_values = p_values(replicates, evaluation, tried if directions else [best, *tried])
     significance, found, _ = best_direction(replicates, evaluation, best)
     # the noise of a fitted signature, at a small strength, takes nothing from the p-value of a test that was sharper;
     # the significance is that of the fitted one, as of its rivals
     looks = [t for t in tried if t.sharp and t.candidate.name == best.candidate.name and not large]
     sharper = min(p_values(replicates, evaluation, looks)[0], default=1.0)
     if found.size <= 0:
-        return 0.0, max(trials_corrected(own, sharper), LEAST_P)
+        return 0.0, max(trials_corrected(replicate_p_values, sharper), LEAST_P)
     sides = max(len(best.candidate.strengths) if _sided(best) else 1, 1)
     # no direction by itself may be significant, but all together
     together = min((p for p, _ in _p_values_of_group(replicates, evaluation, directions)), default=1.0)
@@ -135,7 +135,7 @@ def p_of_best(
     if large:  # far from the model the signature is not linear: the evidence itself, in the same units
         significance = max(significance, math.sqrt(max(best.evidence, 0.0) / max(found.spread**2, 0.5)))
     one = float(_p_of_square(significance**2, sides, found.freedom)) / (1 if _two_sided(best) else 2)
-    return significance, max(trials_corrected(own, min(one, together, sharper)), LEAST_P)
+    return significance, max(trials_corrected(replicate_p_values, min(one, together, sharper)), LEAST_P)
 
 
 def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: Trial) -> bool:
@@ -154,7 +154,7 @@ def explains_its_signature(replicates: Replicates, evaluation: Evaluation, one: 
     )
     if one.sensors is not None and not template @ there:
         # so faint that each cell's shift may be noise and is left out; the projection of all shifts is significant
-        (whole,) = signatures(replicates, evaluation, [one.sensors], 2 * FEW, kept="all")
+        (whole,) = signatures(replicates, evaluation, [one.sensors], Sampling(few=2 * FEW, kept="all"))
         if not isinstance(whole, CannotSimulate):
             there = stacked(template_of(replicates, evaluation, whole), keys)
             least = _NOISE_SHARE
@@ -173,9 +173,9 @@ def p_values(replicates: Replicates, evaluation: Evaluation, tried: Sequence[Tri
     data: list[float] = []
     least = np.ones(len(evaluation.replicate_residuals[TOTALS]))
     for group in groups.values():
-        for p, own in _p_values_of_group(replicates, evaluation, group):
+        for p, replicate_p_values in _p_values_of_group(replicates, evaluation, group):
             data.append(p)
-            least = np.minimum(least, own)
+            least = np.minimum(least, replicate_p_values)
     return data, least
 
 
@@ -233,11 +233,11 @@ def _hotelling(found: Sequence[ScoreTest], signed: bool) -> tuple[float, np.ndar
         found: a score test for each direction.
         signed: the test is two-sided.
     """
-    own = np.stack([x.own for x in found], axis=1)
-    alike = own.T @ own / len(own)
+    scores = np.stack([x.replicates for x in found], axis=1)
+    alike = scores.T @ scores / len(scores)
     alike = _HELD * alike + (1 - _HELD) * np.diag(np.diag(alike))
     np.fill_diagonal(alike, np.maximum(np.diag(alike), 1.0))
-    all_ = np.vstack([[x.data for x in found], own])
+    all_ = np.vstack([[x.data for x in found], scores])
     square = np.einsum("ri,ij,rj->r", all_, np.linalg.inv(alike), all_)
     p = _p_of_square(square, len(found), min(x.freedom for x in found))
     if not signed:  # one-sided: a negative score is no evidence
@@ -251,14 +251,15 @@ def _p_of_square(square: np.ndarray | float, directions: int, freedom: float) ->
     return np.asarray(stats.f.sf(np.asarray(square) * second / (directions * freedom), directions, second))
 
 
-def trials_corrected(own: np.ndarray, least: float) -> float:
+def trials_corrected(replicate_p_values: np.ndarray, least: float) -> float:
     """The p-value of the smallest of many p-values.
 
     Args:
-        own: (replicates,) the smallest p-value in each replicate.
+        replicate_p_values: (replicates,) the smallest p-value in each replicate.
         least: that in the data.
     """
-    number = max(1 / max(float(own.mean()), 1e-6) - 1, 1.0)  # trials factor: the effective number of independent tests
+    # trials factor: the effective number of independent tests
+    number = max(1 / max(float(replicate_p_values.mean()), 1e-6) - 1, 1.0)
     return float(-np.expm1(number * np.log1p(-min(least, 1 - 1e-12))))
 
 
@@ -269,15 +270,15 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
 
     z_k, v_k: residuals and template of statistic k; z*: residuals of the replicates, cross-fitted in folds; P_k: the
     inverse of the shrunk covariance (Schaefer and Strimmer 2005) for 2 to 32 cells, otherwise the identity. Without a
-    signature `size`, `data` and `own` are 0.
+    signature `size`, `data` and `replicates` are 0.
     """
     template = template_of(replicates, evaluation, signature)
     keys = [k for k, t in template.items() if t.any()]
     many = len(evaluation.replicate_residuals[TOTALS])
     most = float(many - 1)
     if not keys:
-        return ScoreTest(0.0, 0.0, np.zeros(many), 1.0, most)
-    own = np.zeros(many)
+        return ScoreTest(size=0.0, data=0.0, replicates=np.zeros(many), spread=1.0, freedom=most)
+    scores = np.zeros(many)
     size = data = norm = fourth = wild = 0.0
     for key in keys:
         whole, *parts = _weightings(evaluation, key)
@@ -286,7 +287,7 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
             t = null.law.scores(t)
         w = whole(t)
         for part, weigh in zip(_folds(many), parts, strict=True):
-            own[part] += evaluation.replicate_residuals[key][part] @ weigh(t)
+            scores[part] += evaluation.replicate_residuals[key][part] @ weigh(t)
         size, data = size + float(t @ w), data + float(evaluation.residuals[key] @ w)
         norm, fourth = norm + float(w @ w), fourth + float(np.sum(w**4))
         wild += float(np.sum(w[~_nearly_normal(replicates, evaluation, key)] ** 4))
@@ -294,11 +295,17 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
     # many cells may scatter less together than independent ones; the score of a single one is not divided by a
     # scatter that rare counts make small
     cells = norm**4 / fourth
-    spread = max(float(own.std()) / norm, 0.5 + 0.5 / math.sqrt(cells))
+    spread = max(float(scores.std()) / norm, 0.5 + 0.5 / math.sqrt(cells))
     # dependent cells may be far out together: the tails are those of few
     few = 2 * norm**4 / max(wild, 1e-300) / spread**2
     freedom = most if spread < _TOGETHER else min(max(few, _FEWEST), most)
-    return ScoreTest(size / norm / spread, data / norm / spread, own / norm / spread, spread, freedom)
+    return ScoreTest(
+        size=size / norm / spread,
+        data=data / norm / spread,
+        replicates=scores / norm / spread,
+        spread=spread,
+        freedom=freedom,
+    )
 
 
 def _nearly_normal(replicates: Replicates, evaluation: Evaluation, key: Cell) -> np.ndarray:
@@ -316,33 +323,33 @@ def _folds(recordings: int) -> list[slice]:
 
 def _weightings(evaluation: Evaluation, key: Cell) -> list[_Weigh]:
     """Functions template -> weights of a statistic's cells: by all replicates, and by those outside each fold."""
-    own = evaluation.replicate_residuals[key]
-    many, cells = own.shape
+    replicate_residuals = evaluation.replicate_residuals[key]
+    many, cells = replicate_residuals.shape
     if key == TOTALS or not 1 < cells <= _SMALL:
         return [lambda t: t] * (_FOLDS + 1)
 
     def made() -> list[_Weigh]:
-        rests = [np.delete(own, np.arange(many)[part], axis=0) for part in _folds(many)]
-        return [_inverse_covariance(x) for x in [own, *rests]]
+        rests = [np.delete(replicate_residuals, np.arange(many)[part], axis=0) for part in _folds(many)]
+        return [_inverse_covariance(x) for x in [replicate_residuals, *rests]]
 
     return evaluation.once(("weights", key), made)
 
 
-def _inverse_covariance(own: np.ndarray) -> _Weigh:
+def _inverse_covariance(replicate_residuals: np.ndarray) -> _Weigh:
     """A function template -> weights (cells,), by the inverse of the shrunk covariance.
 
     Source: Schaefer and Strimmer, Stat. Appl. Genet. Mol. Biol. 4 (2005) 32, for correlations.
 
     Args:
-        own: (replicates, cells) residuals.
+        replicate_residuals: (replicates, cells) residuals.
     """
-    together = own.T @ own / len(own)
+    together = replicate_residuals.T @ replicate_residuals / len(replicate_residuals)
     alone = np.maximum(np.diag(together), _LEAST_VARIANCE)
     alike = together / np.sqrt(np.outer(alone, alone))
     np.fill_diagonal(alike, 0.0)
     square, pairs = float(np.sum(alike**2)), len(alike) * (len(alike) - 1)
-    by_chance = (pairs - square) / len(own)
-    together *= min(max(0.0, 1 - by_chance / max(square, 1e-30)), 1 - 1 / len(own))
+    by_chance = (pairs - square) / len(replicate_residuals)
+    together *= min(max(0.0, 1 - by_chance / max(square, 1e-30)), 1 - 1 / len(replicate_residuals))
     np.fill_diagonal(together, alone)
     inverse = np.linalg.inv(together)
     return lambda t: np.asarray(inverse @ t)
@@ -384,14 +391,14 @@ def p_of_map(
     weight = np.sqrt([total_information[id] for id, _ in cells])
     weight /= math.sqrt(float(weight @ weight))
     z = sum(w * evaluation.residuals[cell] for w, cell in zip(weight, cells, strict=True))
-    own = sum(w * evaluation.replicate_residuals[cell] for w, cell in zip(weight, cells, strict=True))
+    replicate_residuals = sum(w * evaluation.replicate_residuals[cell] for w, cell in zip(weight, cells, strict=True))
     if candidate.per == "code":
         parts = pixel_maps.code_periods(size)
-        return min(1.0, len(parts) * min(p_of_spread(z[part], own[:, part]) for part in parts.values()))
+        return min(1.0, len(parts) * min(p_of_spread(z[part], replicate_residuals[:, part]) for part in parts.values()))
     groups = pixel_maps.groups_of(evaluation.sensors.one, candidate.per)
     if any(replicates.of_scene(id) for id, _ in cells):
         sensitivity = np.sqrt([information[id] for id, _ in cells])
-        rows = [[evaluation.replicate_residuals[cell][k] for cell in cells] for k in range(len(own))]
+        rows = [[evaluation.replicate_residuals[cell][k] for cell in cells] for k in range(len(replicate_residuals))]
         data, *null = (
             _scores_of_groups(row, sensitivity, groups)
             for row in ([evaluation.residuals[cell] for cell in cells], *rows)
@@ -400,7 +407,7 @@ def p_of_map(
     else:
         count = np.sqrt(np.bincount(groups))
         data = np.bincount(groups, z) / count
-        null_data = np.stack([np.bincount(groups, row) / count for row in own])
+        null_data = np.stack([np.bincount(groups, row) / count for row in replicate_residuals])
         p = p_of_spread(data, null_data)
     if candidate.per != "pixel":
         return p

@@ -86,7 +86,9 @@ class SetupExplanation:
     def without(self, factor: Factor) -> SetupExplanation:
         """The same residuals with the other factors alone."""
         kept = [k for k, one in enumerate(self.factors) if one != factor]
-        return SetupExplanation(tuple(self.factors[k] for k in kept), self.logs[kept], self.errors[kept], self.left)
+        return SetupExplanation(
+            factors=tuple(self.factors[k] for k in kept), logs=self.logs[kept], errors=self.errors[kept], left=self.left
+        )
 
     @property
     def explains(self) -> bool:
@@ -129,7 +131,9 @@ def explanations(replicates: Replicates, evaluation: Evaluation) -> list[SetupEx
             continue
         covariance = np.linalg.inv(design.T @ design)
         logs = covariance @ design.T @ z
-        found.append(SetupExplanation(factors, logs, np.sqrt(np.diag(covariance)), z - design @ logs))
+        found.append(
+            SetupExplanation(factors=factors, logs=logs, errors=np.sqrt(np.diag(covariance)), left=z - design @ logs)
+        )
     return sorted((e for e in found if e.explains), key=lambda e: e.cost)
 
 
@@ -262,7 +266,14 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
         for tried in templates(candidate):
             with scan.if_possible(candidate, "explaining the totals", wholly=False):
                 sensors = evaluation.sensors.changed(tried)
-                one = Trial(candidate, tried, signature_of_totals(replicates, evaluation, sensors), 0.0, 1.0, sensors)
+                one = Trial(
+                    candidate=candidate,
+                    values=tried,
+                    signature=signature_of_totals(replicates, evaluation, sensors),
+                    fall=0.0,
+                    times=1.0,
+                    sensors=sensors,
+                )
                 one.fall, one.times = scan.line_search(evaluation, one.signature, one.signed)
                 if one.fall < COST_OF_A_PARAMETER:
                     continue
@@ -349,12 +360,12 @@ def _fitted(scan: Scan, evaluation: Evaluation, one: Trial) -> Trial:
     half = HALF_95 * math.sqrt(covariance)
     residuals = {**evaluation.residuals, TOTALS: z}
     return Trial(
-        one.candidate,
-        given,
-        signature,
-        one.fall,
-        1.0,
-        evaluation.sensors.changed(given),
+        candidate=one.candidate,
+        values=given,
+        signature=signature,
+        fall=one.fall,
+        times=1.0,
+        sensors=evaluation.sensors.changed(given),
         residuals=residuals,
         intervals={coordinate.key: coordinate.interval(u - half, u + half)},
     )

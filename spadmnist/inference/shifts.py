@@ -62,7 +62,8 @@ def beyond_noise(
     if not sure:
         _, by_own, _, one = _beyond(n, 1)
         return shift if float(square.mean()) > noise * by_own else np.where(square > noise * one, shift, 0.0)
-    mean, variance = float(null.own.mean()), float(null.own.var()) * (1 + math.sqrt(5 / null.recordings))
+    mean = float(null.replicate_squares.mean())
+    variance = float(null.replicate_squares.var()) * (1 + math.sqrt(5 / null.recordings))
     together = round(min(n, max(1.0, 2 * mean**2 / max(variance, 1e-30))))  # effective number of independent cells
     # a fluctuating light differs in every replicate: its noise exceeds the scatter of the model's own replicates
     most = max(most, noise / _least_ratio((few - 1) * together))

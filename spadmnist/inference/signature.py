@@ -62,7 +62,9 @@ class Signature:
         shifts = {cell: x for cell, x in self.shifts.items() if cell[0] in ids}
         noise = {cell: x for cell, x in self.noise.items() if cell[0] in ids}
         even = None if self.even is None else self.even.only(ids)
-        return Signature(shifts, noise, self.logs, self.nothing, even, self.fluctuates)
+        return Signature(
+            shifts=shifts, noise=noise, logs=self.logs, nothing=self.nothing, even=even, fluctuates=self.fluctuates
+        )
 
     def completed(self, other: Signature, ids: Collection[str]) -> Signature:
         """The signature, completed by that of `other` in captures of which this one has the totals alone."""
@@ -73,17 +75,24 @@ class Signature:
             even = (even or Signature({}, {}, {})).completed(there.even or Signature({}, {}, {}), ids)
         shifts, noise = {**self.shifts, **there.shifts}, {**self.noise, **there.noise}
         fluctuates = self.fluctuates or other.fluctuates
-        return Signature(shifts, noise, logs, self.nothing and other.nothing, even, fluctuates)
+        return Signature(
+            shifts=shifts,
+            noise=noise,
+            logs=logs,
+            nothing=self.nothing and other.nothing,
+            even=even,
+            fluctuates=fluctuates,
+        )
 
     def at(self, times: float) -> Signature:
         """The shifts at `times` the strength, as a signature without an even part."""
         if self.even is None and times == 1:
             return self
         out = Signature(
-            {cell: times * x for cell, x in self.shifts.items()},
-            {cell: times**2 * x for cell, x in self.noise.items()},
-            {id: times * x for id, x in self.logs.items()},
-            self.nothing,
+            shifts={cell: times * x for cell, x in self.shifts.items()},
+            noise={cell: times**2 * x for cell, x in self.noise.items()},
+            logs={id: times * x for id, x in self.logs.items()},
+            nothing=self.nothing,
         )
         if self.even is not None:
             for cell, x in self.even.shifts.items():
@@ -115,10 +124,17 @@ class Signature:
         odd = half(up.shifts, down.shifts, -1.0)
         for cell in odd.keys() & (powers or {}).keys():
             typical = ndimage.median_filter(powers[cell], _NEIGHBOURS)  # type: ignore[index]  # a line's own has a sign
-            chance = 2 * typical * np.abs(even.shifts[cell]) / few  # variance of the noise that grows in proportion
-            odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * chance, odd[cell], 0.0)
+            variance = 2 * typical * np.abs(even.shifts[cell]) / few  # of the noise that grows in proportion
+            odd[cell] = np.where(odd[cell] ** 2 > _SURE_SQUARE * variance, odd[cell], 0.0)
         scatters = up.fluctuates or down.fluctuates
-        return Signature(odd, noise, half(up.logs, down.logs, -1.0), up.nothing and down.nothing, even, scatters)
+        return Signature(
+            shifts=odd,
+            noise=noise,
+            logs=half(up.logs, down.logs, -1.0),
+            nothing=up.nothing and down.nothing,
+            even=even,
+            fluctuates=scatters,
+        )
 
 
 def signature_of_totals(replicates: Replicates, evaluation: Evaluation, sensors: Model) -> Signature:
@@ -137,32 +153,45 @@ def signature_of_totals(replicates: Replicates, evaluation: Evaluation, sensors:
         raise SpadError(why(error)) from error
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """What is simulated of a model for its signature, and what is kept of it.
+
+    Attributes:
+        few: replicates of each capture.
+        only: the captures that are simulated; all where it is empty.
+        names: the statistics that are reduced; all where it is empty.
+        hasty: without costly statistics.
+        kept: which shifts are kept. "sure": those that are hardly ever noise (a signature). "likely": those that are
+            hardly all noise (a derivative, which would otherwise be too small). "all": all.
+    """
+
+    few: int = FEW
+    only: Collection[str] = ()
+    names: Collection[str] = ()
+    hasty: bool = True
+    kept: Kept = "likely"
+
+
 def signatures(
     replicates: Replicates,
     evaluation: Evaluation,
     models: Sequence[Model],
-    few: int = FEW,
-    only: Collection[str] = (),
-    hasty: bool = True,
-    kept: Kept = "likely",
+    sampling: Sampling = Sampling(),
     only_of: Sequence[Collection[str]] | None = None,
-    names_of: Sequence[Collection[str]] | None = None,
 ) -> list[Signature | CannotSimulate]:
     """The signature of each model, or the error that says why it cannot be simulated.
 
     Args:
         models: the changed models.
-        few: replicates of each capture.
-        only: the captures that are simulated; all where it is empty.
-        hasty: without costly statistics.
-        kept: which shifts are kept. "sure": those that are hardly ever noise (a signature). "likely": those that are
-            hardly all noise (a derivative, which would otherwise be too small). "all": all.
-        only_of: as `only`, for each model by itself.
-        names_of: the statistics that are reduced, for each model; all where it is empty.
+        sampling: what is simulated of each of them.
+        only_of: as `Sampling.only`, for each model by itself.
     """
-    numbers = np.arange(few, dtype=np.uint64)
-    ids_of = [[id for id in evaluation.made if not some or id in some] for some in only_of or [only] * len(models)]
-    wanted, unable, names = [], dict[int, CannotSimulate](), list[Collection[str]]()
+    numbers = np.arange(sampling.few, dtype=np.uint64)
+    ids_of = [
+        [id for id in evaluation.made if not some or id in some] for some in only_of or [sampling.only] * len(models)
+    ]
+    wanted, unable = [], dict[int, CannotSimulate]()
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
         own = []
         try:
@@ -172,10 +201,10 @@ def signatures(
         except UNABLE as error:
             unable[k], own = CannotSimulate.because(error), []
         wanted += own
-        names += [names_of[k] if names_of else ()] * len(own)
-    simulated = replicates.simulate(wanted, hasty=hasty, names=names)
-    if kept == "sure":  # a derivative is a difference of the same few replicates and needs no more
-        simulated = _more_replicates(replicates, evaluation, wanted, simulated, hasty, names)
+    names = [sampling.names] * len(wanted)
+    simulated = replicates.simulate(wanted, hasty=sampling.hasty, names=names)
+    if sampling.kept == "sure":  # a derivative is a difference of the same few replicates and needs no more
+        simulated = _more_replicates(replicates, evaluation, wanted, simulated, sampling)
     results = iter(simulated)
     out: list[Signature | CannotSimulate] = []
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
@@ -184,7 +213,7 @@ def signatures(
             continue
         made = {id: next(results) for id in ids}
         try:
-            out.append(signature_from(replicates, evaluation, sensors, made, kept))
+            out.append(signature_from(replicates, evaluation, sensors, made, sampling.kept))
         except UNABLE as error:
             out.append(CannotSimulate.because(error))
     return out
@@ -195,8 +224,7 @@ def _more_replicates(
     evaluation: Evaluation,
     wanted: Sequence[tuple[Model, str, np.ndarray, np.ndarray]],
     made: list[CaptureReplicates | CannotSimulate],
-    hasty: bool,
-    names: Sequence[Collection[str]],
+    sampling: Sampling,
 ) -> list[CaptureReplicates | CannotSimulate]:
     """The replicates, and more of them where the totals of a few deviate from the closed form.
 
@@ -217,8 +245,8 @@ def _more_replicates(
         level = photons[0] / evaluation.factors[id][0]
         again.append((sensors, id, level * evaluation.factors[id][more.astype(int)], more))
     out = list(made)
-    some = [names[k] for k in doubtful]
-    found = replicates.simulate(again, hasty=hasty, names=some) if again else []
+    names = [sampling.names] * len(again)
+    found = replicates.simulate(again, hasty=sampling.hasty, names=names) if again else []
     for k, more_of in zip(doubtful, found, strict=True):
         first = out[k]
         out[k] = (
@@ -251,7 +279,7 @@ def signature_from(
 
     Args:
         made: the replicates of some captures; the totals of the others are those of the closed form.
-        kept: see `signatures`.
+        kept: see `Sampling`.
     Raises:
         CannotSimulate: where a capture could not be simulated.
     """
@@ -289,12 +317,12 @@ def signature_from(
             shift, left, beta = mean_shift(new, old, spread)
             if kept != "all":
                 # where the replicates share no noise, that of the null distribution is in the shift, too
-                chance = left + 3.0 * (1 - beta) / null.recordings
-                usual_here, _ = evaluation.expected(cell, float(base.totals.mean()))
-                shift = beyond_noise(shift, spread, chance, null, usual_here, len(other.totals), kept == "sure")
+                noise_here = left + 3.0 * (1 - beta) / null.recordings
+                expected_here, _ = evaluation.expected(cell, float(base.totals.mean()))
+                shift = beyond_noise(shift, spread, noise_here, null, expected_here, len(other.totals), kept == "sure")
             if shift.any():
                 shifts[cell], noise[cell] = shift, left
-    return Signature(shifts, noise, logs, nothing, fluctuates=scattered)
+    return Signature(shifts=shifts, noise=noise, logs=logs, nothing=nothing, fluctuates=scattered)
 
 
 def odd_and_even(replicates: Replicates, evaluation: Evaluation, up: Signature, down: Signature, few: int) -> Signature:

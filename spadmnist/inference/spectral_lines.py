@@ -99,7 +99,9 @@ def spectral_lines(replicates: Replicates, evaluation: Evaluation) -> list[Line]
             evaluation.nulls[id, name], np.asarray(summary.values, float), z, replicates.seen[id].total
         )
         dark = replicates.seen[id].capture.light.dark
-        spectra.append(CaptureSpectrum(np.asarray(summary.values, float), z, surprise, step, dark))
+        spectra.append(
+            CaptureSpectrum(power=np.asarray(summary.values, float), z=z, surprise=surprise, step=step, dark=dark)
+        )
     groups = [[s] for s in spectra]
     lit = [s for s in spectra if not s.dark]
     if len(lit) > 1:

@@ -61,7 +61,16 @@ def fit_by_statistic(
     weights /= weights.sum(axis=1, keepdims=True)
     estimate, error = mean_of(weights, grid)
     group = groups_of(replicates.start, candidate.per)
-    map_ = PixelMap(candidate.carrier, base, group, estimate, error, raw, raw_error, width.sigma)
+    map_ = PixelMap(
+        carrier=candidate.carrier,
+        base=base,
+        group=group,
+        estimate=estimate,
+        error=error,
+        raw=raw,
+        raw_error=raw_error,
+        sigma=width.sigma,
+    )
     low, high = bounds
     return replace(map_, low=low, high=high, likely=(grid, weights), certain=0.0, width=width)
 

@@ -58,15 +58,15 @@ def measure(replicates: Replicates, rungs: Sequence[Rung]) -> float:
             (signature,) = signatures(half, there, [there.sensors.changed(rung.placebo)])
             if not isinstance(signature, CannotSimulate):
                 residuals = residuals_at(half, there, signature)
-        own = _with_halves(rung.evaluation.replicate_residuals, there.replicate_residuals, apart)
+        replicate_residuals = _with_halves(rung.evaluation.replicate_residuals, there.replicate_residuals, apart)
         left = _with_halves(rung.left, residuals, apart)
         if rung.fit is not None:
             jacobian = _with_halves(
                 rung.fit.jacobian, jacobian_of_halves(replicates, half, rung.fit.jacobian, apart), apart
             )
             left = held_out.leave_one_capture_out(_with_halves(rung.evaluation.residuals, residuals, apart), jacobian)
-        rung.left, rung.misfit = left, mean_misfit(own, left)
-        first = first or own
+        rung.left, rung.misfit = left, mean_misfit(replicate_residuals, left)
+        first = first or replicate_residuals
     replicates.simulations += half.simulations - begun
     _set_misfits(rungs)
     return misfit_null_95(first)

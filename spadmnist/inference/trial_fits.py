@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,9 +15,10 @@ from .evaluation import Evaluation, block_checks, failing, square, stacked
 from .gauss_newton import Effort, Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_phase, simulate_phases
 from .random_pixels import fit_by_own_scatter
-from .replicates import FEW, TOTALS, CannotSimulate, Replicates
+from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
 from .signature import (
     IGNORED,
+    Sampling,
     captures_informing,
     captures_showing,
     residuals_at,
@@ -156,7 +157,7 @@ def boost_of(
     ups = [{d.key: d.scaled(float(given[d.key]), x) for d in strengths} for x in (boost, math.sqrt(boost))]
     models = [evaluation.sensors.changed({**given, **up}, one.phases, one.chips) for up in ups]
     templates = []
-    for signature in signatures(replicates, evaluation, models, 2 * FEW, kept="sure"):
+    for signature in signatures(replicates, evaluation, models, Sampling(few=2 * FEW, kept="sure")):
         if isinstance(signature, CannotSimulate):
             return 1.0, 1.0
         templates.append(stacked(template_of(replicates, evaluation, signature), list(evaluation.residuals)))
@@ -179,18 +180,27 @@ def fit_by_probes(
     Args:
         only, names: the captures that are simulated, and the statistics that are reduced, as in `gauss_newton`.
     """
+
+    def residuals_of(tries: Sequence[Mapping[Key, Any]]) -> Iterator[dict[Cell, np.ndarray] | None]:
+        models = [evaluation.sensors.changed(values, one.phases, one.chips) for values in tries]
+        for signature in signatures(replicates, evaluation, models, Sampling(only=only, names=names)):
+            if isinstance(signature, CannotSimulate):
+                yield None
+            else:
+                yield residuals_at(replicates, evaluation, signature)
+
     for coordinate in one.candidate.coordinates:
         if coordinate not in found.coordinates or not coordinate.log:
             continue
         if coordinate in one.candidate.shapes:
-            found, _ = _nearest(replicates, evaluation, one, found, coordinate, _PROBES, only, names)
+            found, _ = _nearest(residuals_of, found, coordinate, _PROBES)
         elif is_edge(coordinate):
             for _ in range(_MOVES):  # an edge is not seen from afar: step by step, long ones first
-                found, better = _nearest(replicates, evaluation, one, found, coordinate, _FAR, only, names)
+                found, better = _nearest(residuals_of, found, coordinate, _FAR)
                 if not better:
                     break
             for probes in (_PROBES, _FINE):
-                found, _ = _nearest(replicates, evaluation, one, found, coordinate, probes, only, names)
+                found, _ = _nearest(residuals_of, found, coordinate, probes)
     return found
 
 
@@ -216,39 +226,36 @@ def _strengths_anew(one: Trial, found: Fit, fit: Callable[[Mapping[Key, Any], in
     for cell, x in again.jacobian.items():
         jacobian[cell][:, moving] = x
     return Fit(
-        found.coordinates,
-        point_of(found.coordinates, again.values),
-        found.covariance,
-        again.residuals,
-        jacobian,
-        again.square,
-        again.values,
-        found.phases,
+        coordinates=found.coordinates,
+        point=point_of(found.coordinates, again.values),
+        covariance=found.covariance,
+        residuals=again.residuals,
+        jacobian=jacobian,
+        square=again.square,
+        values=again.values,
+        phases=found.phases,
     )
 
 
 def _nearest(
-    replicates: Replicates,
-    evaluation: Evaluation,
-    one: Trial,
+    residuals_of: Callable[[Sequence[Mapping[Key, Any]]], Iterable[dict[Cell, np.ndarray] | None]],
     found: Fit,
     coordinate: Coordinate,
     probes: Sequence[float],
-    only: Collection[str],
-    names: Collection[str],
 ) -> tuple[Fit, bool]:
-    """(best of the probes on both sides of a coordinate, or the fit itself; whether it is a probe)."""
+    """(best of the probes on both sides of a coordinate, or the fit itself; whether it is a probe).
+
+    Args:
+        residuals_of: values of several models, SI -> residuals of each, (cells,) by block; None where it cannot be
+            simulated.
+        probes: distances, in the coordinate.
+    """
     at, before = float(found.values[coordinate.key]), found
     steps = [s * x for x in probes for s in (-1, 1)]
     tries = [{**found.values, coordinate.key: coordinate.value(coordinate.coordinate(at) + x)} for x in steps]
-    models = [evaluation.sensors.changed(t, one.phases, one.chips) for t in tries]
     best = found.square - 6
-    made = signatures(replicates, evaluation, models, FEW, only, names_of=[names] * len(models))
-    for tried, x, signature in zip(tries, steps, made, strict=True):
-        if isinstance(signature, CannotSimulate):
-            continue
-        residuals = residuals_at(replicates, evaluation, signature)
-        if square(residuals) < best:
+    for tried, x, residuals in zip(tries, steps, residuals_of(tries), strict=True):
+        if residuals is not None and square(residuals) < best:
             best = square(residuals)
             found = replace(
                 found, point=point_of(found.coordinates, tried), residuals=residuals, square=best, values=tried
@@ -289,9 +296,17 @@ def _fit_phases(replicates: Replicates, evaluation: Evaluation, one: Trial) -> T
         cell: (aside[0][cell] - aside[1][cell])[:, None] / (np.array(apart) - now)[None, :] / len(coordinates)
         for cell in residuals
     }
-    own = np.concatenate([evaluation.replicate_residuals[cell] for cell in residuals], axis=1)
-    covariance = covariance_of(np.concatenate(list(jacobian.values())), own)
-    one.fit = Fit(coordinates, now, covariance, residuals, jacobian, square(residuals), one.values)
+    replicate_residuals = np.concatenate([evaluation.replicate_residuals[cell] for cell in residuals], axis=1)
+    covariance = covariance_of(np.concatenate(list(jacobian.values())), replicate_residuals)
+    one.fit = Fit(
+        coordinates=coordinates,
+        point=now,
+        covariance=covariance,
+        residuals=residuals,
+        jacobian=jacobian,
+        square=square(residuals),
+        values=one.values,
+    )
     return one
 
 

@@ -16,7 +16,7 @@ from .replicates import FEW, CannotSimulate, Cell, Replicates
 from .results import plain
 from .scan import Scan
 from .score_test import ScoreTest, score_test
-from .signature import Signature, captures_showing, odd_and_even, signatures, template_of
+from .signature import Sampling, Signature, captures_showing, odd_and_even, signatures, template_of
 from .trial import Trial, shape_of
 
 _BEYOND = 0.05  # probability that a strength above its limit gives a score as small as that of the data
@@ -236,7 +236,7 @@ def _as_strong(
         for value in strengths:
             models.append(evaluation.sensors.changed({**one.values, coordinate.key: value}))
             only.append(ids)
-    made = iter(signatures(replicates, evaluation, models, FEW, kept="sure", only_of=only))
+    made = iter(signatures(replicates, evaluation, models, Sampling(kept="sure"), only_of=only))
     out: list[Signature | None] = []
     for (_, _, ids), number in zip(asked, signs, strict=True):
         up, down = next(made), next(made) if number == 2 else None

@@ -472,8 +472,8 @@ def _draw_maps(figure: Figure, cells: Cells) -> None:
     two = len(residuals) > 1
     panels: list[tuple[np.ndarray, tuple[float, float], str, str]] = []
     if ratios:
-        usual = np.abs(ratios[0][np.isfinite(ratios[0]) & (ratios[0] > _NOTHING)])
-        high = float(np.clip(np.quantile(usual, 0.99) if usual.size else 0.0, math.log(1.002), math.log(100)))
+        sizes = np.abs(ratios[0][np.isfinite(ratios[0]) & (ratios[0] > _NOTHING)])
+        high = float(np.clip(np.quantile(sizes, 0.99) if sizes.size else 0.0, math.log(1.002), math.log(100)))
         titles = ("measured / model before", "measured / model after") if two else ("measured / simulated",)
         panels += [(ratio, (-high, high), title, "PuOr_r") for ratio, title in zip(ratios, titles, strict=True)]
     elif not two:
