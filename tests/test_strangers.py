@@ -10,6 +10,7 @@ from labs import Lab
 
 import spadmnist as sp
 from spadmnist import plugins
+from spadmnist.inference.replicates import Replicates
 
 EFFECTS = '''import numpy as np
 
@@ -107,3 +108,15 @@ def test_it_has_an_upper_limit_where_it_is_not_found(lab: Lab, strangers: None) 
         assert 0 < found.upper_limits[key] < 0.7 * true, (key, found.upper_limits)
     # periodic ones are looked for where there are lines, and here are none: that is said, of ours as well
     assert {entry["effect"] for entry in found.as_data()["no_limit"]} >= {"chopper", "flicker"}
+
+
+@pytest.mark.slow
+def test_what_no_effect_describes_is_unexplained(lab: Lab, strangers: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A detector that is less sensitive for 4 us after each detection: what only resembles it is no finding."""
+    stated, data = lab("    half_open: {share: 0.3, until: 4 us}\n", light=300, side=4)
+    every = Replicates.candidates
+    monkeypatch.setattr(
+        Replicates, "candidates", lambda self, sensor: [c for c in every(self, sensor) if c.effect not in TRUE]
+    )
+    found = sp.diagnose(stated, data, quick=True, jobs=1)
+    assert found.verdict == "unexplained" and not found.steps, repr(found)

@@ -504,6 +504,11 @@ def headline(comparison: Comparison) -> str:
     return f"{found_in(c)} ({c.statistic}, {p})"
 
 
+def words_in_sample(comparison: Comparison) -> str:
+    """The misfit of a fitted model in all captures, and its worst check, as a sentence."""
+    return f"In sample, misfit {comparison.misfit:.3f}; worst check: {headline(comparison)}."
+
+
 def found_in(check: Check) -> str:
     """Where a check deviates most, in which capture, and by how much."""
     return f"{check.where}, in {check.capture or 'all captures'}: {check.size}"

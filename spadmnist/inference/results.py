@@ -17,7 +17,7 @@ from ..effects import Effect, Mimic
 from ..foreign import visible
 from ..statistics import Statistic, Summary
 from .candidates import Candidate
-from .comparison import Comparison, headline
+from .comparison import Comparison, words_in_sample
 from .coordinates import Coordinate, Key
 from .deviations import LISTED, listed
 from .replicates import Cell
@@ -311,8 +311,7 @@ def table(found: Diagnosis) -> str:
     if found.steps or found.setup:
         lines.append("")
     if found.in_sample is not None:
-        text = f"In sample, misfit {found.in_sample.misfit:.3f}; worst check: {headline(found.in_sample)}."
-        lines += [*textwrap.wrap(text, 100), ""]
+        lines += [*textwrap.wrap(words_in_sample(found.in_sample), 100), ""]
     names = dict.fromkeys(("mean_rate", "map", "linearity", "intervals", "neighbours"))
     names |= dict.fromkeys(name for row in found.ladder for name in row["errors"])  # of the user's own statistics
     rows: list[tuple[str, ...]] = [("model", "held-out misfit", *(n.replace("_", " ") + " %" for n in names))]

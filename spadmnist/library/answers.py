@@ -380,7 +380,7 @@ class _Found:
         title = f"{self.verdict.replace('_', ' ')}: {results.sentence(self.found)}"
         whole = self.found.in_sample
         if whole is not None:
-            title += f" In sample, misfit {whole.misfit:.3f}; worst check: {comparison.headline(whole)}."
+            title += f" {comparison.words_in_sample(whole)}"
         return html_table(title, ("step", "parameter", "value (95 %)", "sigma", "held-out misfit"), rows)
 
 
