@@ -164,6 +164,11 @@ def make(args: argparse.Namespace) -> int:
 QUESTIONS = ("compare", "diagnose", "unseen-start", "unseen-found")
 
 
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def run(args: argparse.Namespace) -> int:
     folder = Path(args.folder)
     (folder / "answers").mkdir(exist_ok=True)
@@ -255,7 +260,7 @@ def ask(folder: Path, question: str, case: str, args: argparse.Namespace) -> tup
     verb = "diagnose" if question == "diagnose" else "compare"
     options = ["--json", str(told), "--seed", "0"]
     if args.takes_jobs[verb]:
-        options += ["--jobs", str(max((os.cpu_count() or 1) // args.jobs, 1))]
+        options += ["--jobs", str(max(processors() // args.jobs, 1))]
     if verb == "diagnose":
         shutil.rmtree(found, ignore_errors=True)
         answer_file(folder, case, "unseen-found").unlink(missing_ok=True)
@@ -373,7 +378,6 @@ def main(arguments: list[str] | None = None) -> int:
         description="\n\n".join(about[:2]), formatter_class=argparse.RawDescriptionHelpFormatter
     )
     verbs = parser.add_subparsers(dest="verb", required=True)
-    processors = os.cpu_count() or 1
     verbs.add_parser("list", help="the names of all cases")
     making = verbs.add_parser("make", help="write cases, seal their truth")
     making.add_argument("cases", nargs="+", metavar="CASES", help="all, a class, or patterns of names")
@@ -382,7 +386,7 @@ def main(arguments: list[str] | None = None) -> int:
     making.add_argument("--quick", action="store_true", help="16 of the cases, captures half as long")
     making.add_argument("--nulls", type=int, default=30, help="measurements without any effect [30]")
     making.add_argument("--sample", type=int, metavar="N", help="so many of them, drawn by lot [all]")
-    making.add_argument("--jobs", type=int, default=processors)
+    making.add_argument("--jobs", type=int, default=processors())
     running = verbs.add_parser("run", help="spadmnist compare and diagnose over all cases; again: what is missing")
     running.add_argument("folder", metavar="FOLDER")
     running.add_argument(

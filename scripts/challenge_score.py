@@ -229,9 +229,9 @@ def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, flo
 class Goal:
     """What a share is to reach: `low` to `high`.
 
-    It is reached where the share or its Wilson interval is in there, and the share is no less than `least`. Of false
-    alarms `allowed` of `cases` are allowed, and that alone decides: the interval of 2 of 40 lies above 1 %. With fewer
-    than `cases` nothing is said: of 20, one is 5 %.
+    It is reached where the share or a part of its Wilson interval lies in there, and the share is no less than `least`.
+    Of false alarms `allowed` of `cases` are allowed, and that alone decides: the interval of 2 of 40 lies above 1 %.
+    With fewer than `cases` the goal is only said to be out of reach, or nothing is said: of 20, one is 5 %.
     """
 
     low: float = 0.0

@@ -15,7 +15,7 @@ The words of the inference; a cell is one number of a statistic, a candidate one
 
 replicate             a recording that the model makes of a capture; all models draw the same random numbers for it
 null distribution     how a statistic is distributed if the model is right
-residual              measured less expected, in units of the cell's scatter; misfit: the mean square of residuals
+residual              measured less expected, in units of the cell's scatter; misfit: their mean square, expected 1
 nuisance parameter    a number that is fitted and not asked for: the light level of a capture
 signature             the shift of every cell that a candidate makes, in proportion to its strength
 score test            the data's projection on a signature, in standard deviations of the null distribution

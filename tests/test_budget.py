@@ -160,6 +160,28 @@ def test_a_budget_ends_a_search_and_the_answer_says_so(lab, few, monkeypatch):
 
 
 @pytest.mark.slow
+def test_numbers_have_errors_of_their_own_where_the_budget_ends_their_fit(lab, few, monkeypatch):
+    """Those of the rough fit are a half of them or less."""
+    made = lab(AFTERPULSING + "    crosstalk: {probability: 3 %}\n")
+    whole = diagnose(*made, quick=True, jobs=1)
+
+    def ended(path):
+        raise OutOfBudget
+
+    monkeypatch.setattr(model_selection, "complete", ended)
+    told: list[str] = []
+    found = diagnose(*made, quick=True, jobs=1, progress=told.append)
+    assert any(line.startswith("the errors of all numbers") for line in told) and not found.finished
+    names = [step.candidate.effect for step in found.steps]
+    assert set(names) == {"afterpulsing", "crosstalk"} == {step.candidate.effect for step in whole.steps}
+    for step in found.steps:
+        other = next(s for s in whole.steps if s.candidate.effect == step.candidate.effect)
+        one, right = step.values["probability"], other.values["probability"]
+        assert one.low < one.value < one.high
+        assert 0.7 < np.log(one.high / one.low) / np.log(right.high / right.low) < 3
+
+
+@pytest.mark.slow
 def test_the_answer_is_kept_after_each_step(lab, few):
     kept: list[Diagnosis] = []
     found = diagnose(*lab(AFTERPULSING), quick=True, jobs=1, keep=kept.append)

@@ -64,7 +64,7 @@ MEANINGS = {
     "checks[].p_value": "p-value of this check, before the correction for the number of checks",
     "checks[].passes": "whether the model passes",
     "checks[].material": "whether a significant deviation exceeds the tolerance",
-    "checks[].where": "the cell with the largest residual, in words",
+    "checks[].where": "the cell that shows the deviation most, in words",
     "checks[].size": "the deviation there in physical units, in words",
     "steps": "accepted changes of the model, in order",
     "steps[].change": "`add`: an effect that the sensor lacks; `set`: another value; `per_pixel`: a map",

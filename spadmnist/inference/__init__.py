@@ -4,6 +4,7 @@ Its chapters, in reading order:
 
 models, replicates, reduction     what a model records of a capture, and the statistics of that
 laws, null_distribution           how cells scatter if the model is right; residuals
+contrasts                         patterns of all cells that are tested by themselves
 light_levels                      the nuisance parameter of every capture, from its total
 closed_forms, mean_alone          that total by the effects' closed forms; captures of which the mean alone is known
 evaluation, deviations            residuals and checks of one model; failing checks that show one deviation

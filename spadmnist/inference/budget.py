@@ -28,6 +28,7 @@ _DEFAULT, _QUICK = 600.0, 180.0  # s: the default budget, and that of a quick di
 # shares of the budget after which no further step, and no further fit or test of the steps, begins; the rest is for
 # the fits and tests, and for limits and advice
 STEPS, FITS = 0.75, 0.9
+ERRORS = 1.25  # share of the budget that the errors of the numbers may take, where the budget has ended their fit
 
 
 class OutOfBudget(Exception):

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .contrasts import Contrasts
 from .levels import CLEARLY
-from .null_distribution import Null, in_scatters, p_of_squares, tail_of, widening
+from .null_distribution import Null, p_of_squares, tail_of, widening
 from .replicates import TOTALS, Cell, Replicates
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class Together:
         cell: the block of the capture with the most detections, of all that have the statistic. The check belongs to it
             whatever the data are, so that a check that fails under two models is known as the same.
         p: p-value; 1 where fewer than two captures are left.
-        worst: the cell with the largest deviation; z: its residual, of all captures where they deviate alike.
+        worst: the cell that shows it most; z: its residual, of all captures where they deviate alike.
         cells: the blocks that are taken together, that in which it deviates most first.
         alike: whether the same cells deviate in all captures; otherwise the squares are added.
         excess: excess chi square of all captures.
@@ -50,7 +51,7 @@ class Together:
 
     @property
     def clearest(self) -> Cell:
-        """The block in which the worst cell deviates most."""
+        """The block that deviates most."""
         return self.cells[0] if self.cells else self.cell
 
     @property
@@ -105,8 +106,11 @@ def _alike(evaluation: Evaluation, host: Cell, cells: Sequence[Cell], residuals:
     law = evaluation.once(("sums", *cells), lambda: _law_of_sums(evaluation, cells))
     p, worst = law.p_value(z)
     most = float(z[worst])
-    order = sorted(cells, key=lambda cell: -most * float(residuals[cell][worst]))
-    beyond = max(most**2, float(z @ z) - z.size)
+    pattern, beyond = np.zeros(z.size), max(most**2, float(z @ z) - z.size)
+    pattern[worst] = most
+    if law.contrasts is not None and 3 * (contrast := law.contrasts.clearest(z)).p <= p:
+        pattern, beyond = contrast.pattern, max(beyond, float(contrast.pattern @ z) ** 2)
+    order = sorted(cells, key=lambda cell: -float(pattern @ residuals[cell]))
     return Together(cell=host, p=p, worst=worst, z=most, cells=tuple(order), alike=True, excess=beyond)
 
 
@@ -125,7 +129,7 @@ def _law_of_sums(evaluation: Evaluation, cells: Sequence[Cell]) -> Null:
     null = evaluation.nulls[cells[0]]
     contrasts = null.contrasts
     if contrasts is not None:
-        contrasts = in_scatters(contrasts / np.linalg.norm(contrasts, axis=1, keepdims=True), sums)
+        contrasts = Contrasts.learnt(contrasts.patterns, sums, len(sums) - 1)
     return replace(
         null, replicate_squares=np.mean(sums**2, axis=1), tail=tail_of(sums), recordings=len(sums), contrasts=contrasts
     )

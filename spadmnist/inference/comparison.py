@@ -56,7 +56,7 @@ class Check:
         passes: the model passes: the deviation is not significant, or within the tolerance.
         significant: the p-value is significant after Holm's correction.
         material: it is significant and exceeds the tolerance, so that the model fails.
-        where, size: the cell with the largest residual, and the deviation there, in words and physical units.
+        where, size: the cell that shows it most, and the deviation there, in words and physical units.
         relative: that deviation as a share of the detections or of the rate.
     """
 

@@ -43,7 +43,7 @@ class Deviation:
     Attributes:
         statistic, capture: of the check; capture is None where it is of all.
         excess: excess chi square, see `excess`.
-        worst: its cell with the largest residual; where: that cell in words; at: its place on the axis, if any.
+        worst: the cell that shows it most; where: that cell in words; at: its place on the axis, if any.
         size: relative deviation of that cell.
         residuals: (cells,) standard deviations; empty for totals.
     """
@@ -67,17 +67,20 @@ class Deviation:
 
 
 def excess(summary: Summary, expected: np.ndarray, residuals: np.ndarray) -> float:
-    """The excess chi square of a check: that of all cells, or of the largest residual where that is more.
+    """The excess chi square of a check: that of all cells, or of the largest residual or contrast where that is more.
 
-        max(sum z^2 - n, max z^2);  of a power spectrum 2 (r - 1 - log r) of its highest line
+        max(sum z^2 - n, max z^2, max (c z)^2);  of a power spectrum 2 (r - 1 - log r) of its highest line
 
     Args:
         expected: (cells,) in the summary's unit. residuals: (cells,) standard deviations z.
-        r: power over its expectation, exponentially distributed, of which this is the deviance.
+        r: power over its expectation, exponentially distributed, of which this is the deviance. c: the patterns of
+            the summary that are tested by themselves.
     """
     if not residuals.size:
         return 0.0
     largest = float(np.max(np.abs(residuals))) ** 2
+    if summary.contrasts is not None:
+        largest = max(largest, float(np.max((np.asarray(summary.contrasts) @ residuals) ** 2)))
     if law_of(summary.law, summary.scale is not None).spectrum:
         ratio = max(1.0, float(np.max(summary.values / np.maximum(expected, 1e-30))))
         return max(largest, 2 * (ratio - 1 - float(np.log(ratio))))

@@ -447,8 +447,8 @@ class BlockCheck:
     """A check: a block of cells, or the totals.
 
     Attributes:
-        p: two-sided p-value, of its sum of squares or its worst cell.
-        worst: that cell; z: its residual.
+        p: p-value, see `Null.p_value`.
+        worst: the cell that shows it most; z: its residual.
         tests: the number of tests of which p is the smallest p-value.
         together: where p is that of several captures together, their check.
     """

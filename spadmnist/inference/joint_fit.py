@@ -129,12 +129,19 @@ def with_own_errors(path: ModelPath) -> None:
         return
     path.replicates.say("the errors of all numbers")
     evaluation, coordinates = path.evaluation, path.fit.coordinates
-    here = {d.key: path.values[d.key] for d in coordinates}
+    # the last step of a rough fit is not simulated: the evaluation is one step away from the values
+    here = {d.key: evaluation.values.get(d.key, path.values[d.key]) for d in coordinates}
     only = functools.partial(_shown, path)
     by = JacobianBy(_recordings(evaluation), edge_errors(path, path.fit), _known_jacobian(path), only=only)
     model = functools.partial(path.model_at, evaluation)
     made = gauss_newton_step(path.replicates, evaluation, coordinates, here, model, by)
-    path.fit = replace(made, point=point_of(coordinates, here), residuals=evaluation.residuals)
+    there = {d.key: path.values[d.key] for d in coordinates}
+    point = point_of(coordinates, there)
+    move = point - point_of(coordinates, here)
+    residuals = {cell: z + made.jacobian[cell] @ move for cell, z in evaluation.residuals.items()}
+    path.fit = replace(
+        made, point=point, residuals=residuals, square=square(residuals), values={**made.values, **there}
+    )
     _write_values(path, path.fit, _maps_of(path))
 
 

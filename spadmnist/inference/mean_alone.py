@@ -28,9 +28,8 @@ _MOMENTS, _PIXELS = 1024, 1024  # moments and pixels over which a curve of the r
 def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> tuple[CaptureNull, np.ndarray]:
     """(null distribution of a capture whose mean alone is known, (replicates,) factors on its level).
 
-    It is by the closed forms of the effects. Its scatter is that of the counts, of the last digit of the mean, and of
-    the closed forms. What rates that
-    fluctuate do to the mean of frames is no part of them.
+    It is by the closed forms of the effects, corrected for rates that fluctuate where the capture has frames. Its
+    scatter is that of the counts, of the last digit of the mean, of the closed forms, and of that correction.
 
     Args:
         total: detections of the whole array.

@@ -20,7 +20,7 @@ from ..measurement import Measurement
 from ..sensor import Sensor
 from ..workers import Executor, executor
 from . import experiment_design, setups, time_blocks, upper_limits
-from .budget import FITS, STEPS, Budget, OutOfBudget, clock
+from .budget import ERRORS, FITS, STEPS, Budget, OutOfBudget, clock
 from .comparison import Comparison, comparison_of, comparison_with, nothing_to_compare
 from .conclusion import LastLook, Limits, Notes, answer, left_over, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_needless, drop_unexplaining, no_step_explains
@@ -139,9 +139,9 @@ def _diagnosed(
         with or_as_before(path, "dropping the steps that explain too little of their own cells"):
             drop_unexplaining(path, start, not notes.explained)
         take_setup_again(path, notes)
-        if path.approximate:  # no answer is without errors of its own
-            replicates.budget.until = math.inf
-            with or_as_before(path, "the intervals"):
+        if path.approximate:
+            replicates.budget.until = ERRORS
+            with or_as_before(path, "the errors of all numbers: their intervals may be several times too narrow"):
                 with_own_errors(path)
             replicates.budget.until = FITS
     if path.steps and not short and not notes.explained:  # the rates follow from the stated light

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import special, stats
 
 from ..statistics import Summary
+from .contrasts import Contrasts
 from .laws import Law, law_of
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Judgement:
         misfit: mean squared residual relative to that of the model's replicates (1 is expected).
         residuals: (cells,) standard deviations.
         expected, spread: (cells,) expectation and its scatter, in the summary's unit.
-        worst: the cell with the largest residual.
+        worst: the cell that shows the deviation most.
     """
 
     p_value: float
@@ -65,8 +66,7 @@ class Null:
         tail: the same for the largest residuals.
         replicate_squares: (replicates,) mean squared residual of each replicate.
         reach: (least, most) total relative to `middle`, less 1, to which the regression is extrapolated.
-        contrasts: (patterns, cells) of the summary, each of unit length, divided by its scatter in the replicates;
-            None without any.
+        contrasts: patterns of all cells that are tested by themselves; None without any.
     """
 
     law: Law
@@ -79,7 +79,7 @@ class Null:
     tail: float
     replicate_squares: np.ndarray
     reach: tuple[float, float] = (-math.inf, math.inf)
-    contrasts: np.ndarray | None = None
+    contrasts: Contrasts | None = None
 
     def expected(self, total: float) -> tuple[np.ndarray, float]:
         """((cells,) expectation for a capture with this total of detections, its variance relative to the scatter)."""
@@ -122,32 +122,35 @@ class Null:
         )
 
     def p_value(self, z: np.ndarray) -> tuple[float, int]:
-        """(p-value of residuals, the cell of the largest one).
+        """(p-value of residuals, the cell that shows the deviation most).
 
         The p-value is twice the smaller of that of the sum of squares and that of the largest residual. Where there are
-        contrasts, it is three times the smallest, and the cell is that which contributes most to the contrast.
+        contrasts, the sum is of what they do not describe, and the p-value is three times the smallest.
 
         Args:
             z: (cells,) residuals.
         """
-        p_sum = p_of_squares(float(np.mean(z**2)), *self.moments_of_squares(z.size))
+        rest, squares = z, self.replicate_squares
+        if self.contrasts is not None:
+            rest, squares = self.contrasts.without(z), self.contrasts.squares
+        p_sum = p_of_squares(float(np.mean(rest**2)), *self._moments(squares, z.size))
         worst = int(np.argmax(np.abs(z)))
         largest = abs(float(z[worst])) / self.tail
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
         if self.contrasts is None:
             return min(1.0, 2 * min(p_sum, p_cell)), worst
-        scores = self.contrasts @ z
-        clearest = int(np.argmax(np.abs(scores)))
-        # each scatter is that of so many replicates
-        p_contrast = len(scores) * 2 * float(stats.t.sf(abs(scores[clearest]), self.recordings - 1))
-        if p_contrast < min(p_sum, p_cell):
-            worst = int(np.argmax(self.contrasts[clearest] * z * np.sign(scores[clearest])))
-        return min(1.0, 3 * min(p_sum, p_cell, p_contrast)), worst
+        contrast = self.contrasts.clearest(z)
+        if contrast.p < min(p_sum, p_cell):
+            return min(1.0, 3 * contrast.p), contrast.worst
+        return min(1.0, 3 * min(p_sum, p_cell)), worst
 
     def moments_of_squares(self, cells: int) -> tuple[float, float]:
         """(mean, variance) of the mean squared residual of so many cells."""
-        mean = max(float(self.replicate_squares.mean()), 0.05)
-        variance = self.law.variance_of_squares(float(self.replicate_squares.var(ddof=1)), cells)
+        return self._moments(self.replicate_squares, cells)
+
+    def _moments(self, squares: np.ndarray, cells: int) -> tuple[float, float]:
+        mean = max(float(squares.mean()), 0.05)
+        variance = self.law.variance_of_squares(float(squares.var(ddof=1)), cells)
         return mean, variance * widening(self.recordings)
 
     def residuals(self, values: np.ndarray, expected: np.ndarray, leverage: float | np.ndarray) -> np.ndarray:
@@ -215,7 +218,7 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
     z = z / factor
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)
-    known = None if contrasts is None else in_scatters(contrasts, z)
+    known = None if contrasts is None else Contrasts.learnt(contrasts, z, n - len(coefficients))
     return Null(
         law=law,
         middle=middle,
@@ -229,17 +232,6 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
         reach=reach,
         contrasts=known,
     )
-
-
-def in_scatters(contrasts: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Contrasts divided by their scatter in replicates, which is at least that of independent cells.
-
-    Args:
-        contrasts: (patterns, cells), each of unit length.
-        z: (replicates, cells) residuals.
-    """
-    scatter = np.sqrt(np.mean((z @ contrasts.T) ** 2, axis=0))
-    return np.asarray(contrasts / np.maximum(scatter, 1.0)[:, None])
 
 
 def _terms(x: np.ndarray, terms: int) -> np.ndarray:

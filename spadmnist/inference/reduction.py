@@ -215,11 +215,8 @@ def _problem(found: Summary) -> tuple[str, str] | None:
         column = getattr(found, name)
         if column is not None and np.shape(column) != values.shape:
             return f"has {name} of shape {np.shape(column)}", f"it has a number for each cell, {values.shape}"
-    shape = np.shape(found.contrasts) if found.contrasts is not None else (1, values.size)
-    if len(shape) != 2 or shape[1] != values.size or not shape[0]:
-        return f"has contrasts of shape {shape}", f"they are (patterns, cells), of {values.size} cells"
-    if found.contrasts is not None and not np.allclose(np.linalg.norm(found.contrasts, axis=1), 1.0):
-        return "has contrasts that are not of unit length", "the squares of each pattern add up to 1"
+    if found.contrasts is not None and (bent := _problem_of_contrasts(found.contrasts, values.size)):
+        return bent
     if found.scale is not None and not np.all((np.asarray(found.scale) >= 0) & (np.asarray(found.scale) < np.inf)):
         return "has a scale that is negative or not finite", "it is the size of the spread of each cell"
     if found.shape is not None and int(np.prod(found.shape)) != values.size:
@@ -233,6 +230,20 @@ def _problem(found: Summary) -> tuple[str, str] | None:
         number = isinstance(size, tuple) and len(size) == 2 and isinstance(size[1], float | int | np.number)
         if not number or not isinstance(size[0], str):
             return f"says {size!r} for size({cell}, measured, expected)", "it is (text, share of the detections)"
+    return None
+
+
+def _problem_of_contrasts(contrasts: object, cells: int) -> tuple[str, str] | None:
+    """(what is wrong with the contrasts of a user's statistic, what is right), or None."""
+    right = f"they are (patterns, cells), of {cells} cells, each of unit length and at right angles to the others"
+    try:
+        patterns = np.asarray(contrasts, np.float64)
+    except (TypeError, ValueError):
+        return "has contrasts that are no array of numbers", right
+    if patterns.ndim != 2 or patterns.shape[1] != cells or not len(patterns):
+        return f"has contrasts of shape {patterns.shape}", right
+    if not np.allclose(patterns @ patterns.T, np.eye(len(patterns)), atol=1e-6):
+        return "has contrasts that are not of unit length, or not at right angles", right
     return None
 
 

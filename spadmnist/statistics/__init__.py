@@ -43,8 +43,8 @@ class Summary:
     axis: (cells,) what a picture has on its horizontal axis, and its label; log: on a logarithmic scale. shape: (rows,
     columns) where the cells are a map of the array. nested: (cells,) of normal scores of which each is of what the one
     before is of and of more, as counts in windows twice as long: their correlation with that one. contrasts: (patterns,
-    cells) of independent cells, each of unit length: a deviation of this pattern is tested by itself, for one that is
-    spread over all cells is lost in the sum of their squares.
+    cells), orthonormal: a deviation of this pattern is tested by itself, for one that is spread over all cells is lost
+    in the sum of their squares.
     """
 
     values: np.ndarray
