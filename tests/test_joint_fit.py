@@ -96,3 +96,25 @@ def test_a_line_that_a_step_misses_is_seen_beside_the_noise_of_many_other_cells(
     assert 160 < rise < 3 * noise
     rise, noise = joint_fit.rise_of(before, after, joint_fit.informing(fit))
     assert rise > 3 * noise
+
+
+def test_errors_of_their_own_belong_to_the_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last step of a rough fit is not simulated: residuals of the evaluation would take it for a misfit."""
+    start = {STRENGTH.key: 0.01, SHAPE.key: 1e-7}
+
+    def one_step(replicates: Any, evaluation: Any, coordinates: Any, here: Any, *rest: Any) -> Fit:
+        assert here == start
+        z, u = evaluation.residuals[BLOCK], np.zeros(2)
+        return Fit(coordinates, u, np.eye(2), {BLOCK: z}, {BLOCK: SLOPE}, float(z @ z), dict(here))
+
+    monkeypatch.setattr(joint_fit, "gauss_newton_step", one_step)
+    monkeypatch.setattr(joint_fit, "_recordings", lambda evaluation: 8)
+    rough = Fit((STRENGTH, SHAPE), np.zeros(2), np.eye(2), {}, {}, 0.0, {})
+    path: Any = SimpleNamespace(
+        fit=rough, approximate=True, steps=[], values=dict(TRUE), evaluation=evaluation_at(start, np.zeros(CELLS)),
+        replicates=SimpleNamespace(say=lambda what: None), model_at=lambda *_: None,
+    )  # fmt: skip
+    joint_fit.with_own_errors(path)
+    np.testing.assert_allclose(path.fit.residuals[BLOCK], CHANCE, atol=1e-9)
+    assert path.fit.square == pytest.approx(float(CHANCE @ CHANCE)) and path.fit.values == TRUE
+    assert list(path.fit.point) == [STRENGTH.coordinate(0.02), SHAPE.coordinate(1e-7)]
