@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from labs import bench_of, labs
 from scipy import stats
 
+from spadmnist.inference.captures_together import Together, checks_together
 from spadmnist.inference.evaluation import block_checks, evaluate
 from spadmnist.inference.null_distribution import Null, learn
 from spadmnist.inference.replicates import no_size
@@ -77,3 +79,38 @@ def test_a_drift_of_the_light_fails_in_the_trend(tmp_path: Path, slope: float, f
     by_cell = {block.cell: block.p for block in block_checks(replicates, evaluation, evaluation.residuals)}
     assert (by_cell["flat", "trend"] < 1e-4) is fails
     assert replicates.seen["flat"].total == pytest.approx(72_750, rel=0.01)  # 0.09 sqrt(72,750 / 12) = 7.0
+
+
+def together(rng: np.random.Generator, rise: float, swing: float = 0.0) -> tuple[Together, float]:
+    """(the check of the contrasts of five captures of unlike length, the least p-value of one by itself)."""
+    nulls, own, z, seen = {}, {}, {}, {}
+    for k in range(5):
+        cell = (f"flat-{k}", "trend")
+        nulls[cell] = null_of(rng, swing)
+        own[cell] = drawn(rng, swing, REPLICATES)
+        z[cell] = drawn(rng, swing, 1)[0] + rise * COURSES[0]
+        summaries = {"trend": SimpleNamespace(axis=np.arange(BLOCKS) * (k + 1.0))}
+        seen[cell[0]] = SimpleNamespace(total=1e5 + k, summaries=summaries)
+    evaluation = SimpleNamespace(nulls=nulls, replicate_residuals=own, once=lambda name, make: make())
+    alone = {cell: nulls[cell].p_value(x)[0] for cell, x in z.items()}
+    found = checks_together(SimpleNamespace(seen=seen), evaluation, z, alone)  # type: ignore[arg-type]
+    assert len(found) == 2 and {check.cell for check in found} == {("flat-4", "trend")}
+    return next(check for check in found if check.alike), min(alone.values())
+
+
+def test_a_drift_that_no_capture_shows_is_found_in_all_together() -> None:
+    """A rise of 3 standard deviations in each of five captures, of other lengths: 6.7 together."""
+    rng = np.random.Generator(np.random.PCG64(6))
+    found = [together(rng, 3.0) for _ in range(40)]
+    assert sum(check.p < 1e-4 for check, _ in found) > 30 > 2 > sum(least < 1e-4 for _, least in found)
+    assert all(check.words == ", alike in 5 captures" for check, _ in found if check.p < 1e-4 and len(check.cells) == 5)
+
+
+@pytest.mark.parametrize("swing", [0.0, 4.0], ids=["steady", "fluctuating"])
+def test_right_models_pass_together(swing: float) -> None:
+    """False-alarm rate 1e-6."""
+    rng = np.random.Generator(np.random.PCG64(7))
+    ps = np.array([together(rng, 0.0, swing)[0].p for _ in range(600)])
+    for bound in (0.5, 0.1, 0.01, 1e-3):
+        few = int(np.sum(ps < bound))
+        assert stats.binom.sf(few - 1, len(ps), bound) > 1e-6, (bound, few)

@@ -1,22 +1,23 @@
 """Deviations that no capture shows by itself: the checks of one statistic in several captures together.
 
-There are two. Cells that deviate alike add up to one normal score each, sum z / sqrt(captures) (Stouffer et al., The
-American Soldier 1 (1949) 45): an echo, crosstalk, rows. What has another pattern in each capture, as a lamp that
-fluctuates, adds up in its squares, sum z^2 over the cells of all captures, whose law is a gamma law with their mean and
-variance. Both are judged against the model's own replicates. A capture that shows a deviation clearly by itself has its
-own check, and is left out.
+There are three. Cells that deviate alike add up to one normal score each, sum z / sqrt(captures) (Stouffer et al., The
+American Soldier 1 (1949) 45): an echo, crosstalk, rows. So do the scores of contrasts, of captures of any length: a
+lamp that is brighter at the start of each. What has another pattern in each capture, as a lamp that fluctuates, adds up
+in its squares, sum z^2 over the cells of all captures, whose law is a gamma law with their mean and variance. All are
+judged against the model's own replicates. A capture that shows a deviation clearly by itself has its own check, and is
+left out.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .contrasts import Contrasts
+from .contrasts import Contrasts, p_of_scores
 from .levels import CLEARLY
 from .null_distribution import Null, p_of_squares, tail_of, widening
 from .replicates import TOTALS, Cell, Replicates
@@ -68,7 +69,8 @@ def checks_together(
 ) -> list[Together]:
     """The checks of several captures together: of each statistic one of the squares, and one for each set of cells.
 
-    Their number and the blocks that they belong to depend on the model and the plan, not on the data.
+    A statistic with contrasts has one more. The number of checks and the blocks that they belong to depend on the model
+    and the plan, not on the data.
 
     Args:
         residuals: (cells,) of the data, by block.
@@ -77,10 +79,27 @@ def checks_together(
     out = []
     for by_place, judge in ((True, _alike), (False, _in_squares)):
         for cells in _groups(replicates, residuals, by_place):
-            host = max(cells, key=lambda cell: replicates.seen[cell[0]].total)
-            some = [cell for cell in cells if alone[cell] >= CLEARLY and evaluation.nulls[cell].replicate_squares.any()]
-            out.append(judge(evaluation, host, some, residuals) if len(some) > 1 else Together(host))
+            out.append(_judged(replicates, evaluation, cells, residuals, alone, judge))
+    for cells in _groups(replicates, residuals, by_place=False):
+        sizes = {cell: len(c.patterns) for cell in cells if (c := evaluation.nulls[cell].contrasts) is not None}
+        some = [cell for cell, size in sizes.items() if size == next(iter(sizes.values()))]
+        if len(some) > 1:
+            out.append(_judged(replicates, evaluation, some, residuals, alone, _along_contrasts))
     return out
+
+
+def _judged(
+    replicates: Replicates,
+    evaluation: Evaluation,
+    cells: list[Cell],
+    residuals: Mapping[Cell, np.ndarray],
+    alone: Mapping[Cell, float],
+    judge: Callable[[Evaluation, Cell, list[Cell], Mapping[Cell, np.ndarray]], Together],
+) -> Together:
+    """The check of these blocks by one of the three ways, without those that are clear by themselves."""
+    host = max(cells, key=lambda cell: replicates.seen[cell[0]].total)
+    some = [cell for cell in cells if alone[cell] >= CLEARLY and evaluation.nulls[cell].replicate_squares.any()]
+    return judge(evaluation, host, some, residuals) if len(some) > 1 else Together(host)
 
 
 def _groups(replicates: Replicates, residuals: Mapping[Cell, np.ndarray], by_place: bool) -> list[list[Cell]]:
@@ -116,22 +135,46 @@ def _alike(evaluation: Evaluation, host: Cell, cells: Sequence[Cell], residuals:
 
 def _law_of_sums(evaluation: Evaluation, cells: Sequence[Cell]) -> Null:
     """The null distribution of cells that are summed over captures, from the sums of the replicates."""
-
-    def scores(cell: Cell) -> np.ndarray:
-        """The residuals of the replicates, scattering as those of other recordings do.
-
-        Each replicate informs its own expectation and scatter: its residuals are too small by a few per cent.
-        """
-        residuals, null = evaluation.replicate_residuals[cell], evaluation.nulls[cell]
-        return residuals * math.sqrt(float(null.replicate_squares.mean()) / max(float(np.mean(residuals**2)), _LEAST))
-
-    sums = _sum([scores(cell) for cell in cells]) / math.sqrt(len(cells))
+    sums = _sum([_of_replicates(evaluation, cell) for cell in cells]) / math.sqrt(len(cells))
     null = evaluation.nulls[cells[0]]
     contrasts = null.contrasts
     if contrasts is not None:
         contrasts = Contrasts.learnt(contrasts.patterns, sums, len(sums) - 1)
     return replace(
         null, replicate_squares=np.mean(sums**2, axis=1), tail=tail_of(sums), recordings=len(sums), contrasts=contrasts
+    )
+
+
+def _of_replicates(evaluation: Evaluation, cell: Cell) -> np.ndarray:
+    """The residuals of the replicates, scattering as those of other recordings do, (replicates, cells).
+
+    Each replicate informs its own expectation and scatter: its residuals are too small by a few per cent.
+    """
+    residuals, null = evaluation.replicate_residuals[cell], evaluation.nulls[cell]
+    return residuals * math.sqrt(float(null.replicate_squares.mean()) / max(float(np.mean(residuals**2)), _LEAST))
+
+
+def _along_contrasts(
+    evaluation: Evaluation, host: Cell, cells: Sequence[Cell], residuals: Mapping[Cell, np.ndarray]
+) -> Together:
+    """The check of contrasts that deviate alike in several captures, whatever the length of their blocks."""
+    known = {cell: null.contrasts for cell in cells if (null := evaluation.nulls[cell]).contrasts is not None}
+    scores = {cell: contrasts.scores(residuals[cell]) for cell, contrasts in known.items()}
+
+    def scatter_of_sums() -> tuple[np.ndarray, int]:
+        own = [contrasts.scores(_of_replicates(evaluation, cell)) for cell, contrasts in known.items()]
+        number = min(map(len, own))
+        sums = _sum([one[:number] for one in own]) / math.sqrt(len(own))
+        return np.maximum(np.sqrt(np.mean(sums**2, axis=0)), 1.0), max(number - 1, 1)
+
+    scatter, freedom = evaluation.once(("contrasts", *cells), scatter_of_sums)
+    sums = _sum(list(scores.values())) / math.sqrt(len(scores)) / scatter
+    p, k = p_of_scores(sums, freedom)
+    order = sorted(known, key=lambda cell: -float(np.sign(sums[k]) * scores[cell][k]))
+    first = residuals[order[0]]
+    worst = int(np.argmax(np.sign(sums[k]) * known[order[0]].patterns[k] * first))
+    return Together(
+        cell=host, p=p, worst=worst, z=float(first[worst]), cells=tuple(order), alike=True, excess=float(sums[k]) ** 2
     )
 
 

@@ -55,10 +55,19 @@ class Contrasts:
         """Residuals (cells,) without what the patterns describe."""
         return np.asarray(z - (z @ self.patterns.T) @ self.patterns)
 
+    def scores(self, z: np.ndarray) -> np.ndarray:
+        """Scores of residuals (..., cells) along the patterns, in standard deviations, (..., patterns)."""
+        return np.asarray(z @ self.patterns.T / self.scatter)
+
     def clearest(self, z: np.ndarray) -> Contrast:
         """The contrast of residuals (cells,) with the smallest p-value, by Student's t law."""
-        scores = self.patterns @ z / self.scatter
-        k = int(np.argmax(np.abs(scores)))
+        scores = self.scores(z)
+        p, k = p_of_scores(scores, self.freedom)
         pattern = self.patterns[k] * np.sign(scores[k])
-        p = min(1.0, len(scores) * 2 * float(stats.t.sf(abs(scores[k]), self.freedom)))
         return Contrast(p=p, pattern=pattern, worst=int(np.argmax(pattern * z)))
+
+
+def p_of_scores(scores: np.ndarray, freedom: int) -> tuple[float, int]:
+    """(p-value of the largest of scores (patterns,), corrected for their number, its index)."""
+    k = int(np.argmax(np.abs(scores)))
+    return min(1.0, len(scores) * 2 * float(stats.t.sf(abs(scores[k]), freedom))), k
