@@ -480,6 +480,7 @@ WRONG: dict[str, tuple[dict[str, str], str, str, bool]] = {
     "short contrasts": ({"more": ", contrasts=np.ones((1, 3))"}, "", r"has contrasts of shape \(1, 3\)", False),
     "long contrasts": ({"more": ", contrasts=np.ones((2, 5))"}, "", "has contrasts that are not of unit length", False),
     "words as contrasts": ({"more": ", contrasts=[['a']]"}, "", "has contrasts that are no array of numbers", False),
+    "nameless contrasts": ({"more": ", contrasts=np.eye(2, 5)"}, "", "has 0 contrast_words", False),
     "another map": ({"more": ", shape=(2, 2)"}, "", r"has the shape \(2, 2\) of a map", False),
     "no place": ({"where": "lambda c: c"}, "", r"says 0 for where\(0\) in dark; it is text", False),
     "few places": ({"where": "lambda c: ('a', 'b')[c]"}, "", r":\d+: .* failed: IndexError", False),

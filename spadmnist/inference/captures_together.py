@@ -40,6 +40,7 @@ class Together:
         cells: the blocks that are taken together, that in which it deviates most first.
         alike: whether the same cells deviate in all captures; otherwise the squares are added.
         excess: excess chi square of all captures.
+        contrast: the index of the contrast, where one decides.
     """
 
     cell: Cell
@@ -49,6 +50,7 @@ class Together:
     cells: tuple[Cell, ...] = ()
     alike: bool = True
     excess: float = 0.0
+    contrast: int | None = None
 
     @property
     def clearest(self) -> Cell:
@@ -123,14 +125,17 @@ def _alike(evaluation: Evaluation, host: Cell, cells: Sequence[Cell], residuals:
     """The check of cells that deviate alike in several captures."""
     z = _sum([residuals[cell] for cell in cells]) / math.sqrt(len(cells))
     law = evaluation.once(("sums", *cells), lambda: _law_of_sums(evaluation, cells))
-    p, worst = law.p_value(z)
+    p, worst, contrast = law.p_value(z)
     most = float(z[worst])
     pattern, beyond = np.zeros(z.size), max(most**2, float(z @ z) - z.size)
     pattern[worst] = most
-    if law.contrasts is not None and 3 * (contrast := law.contrasts.clearest(z)).p <= p:
-        pattern, beyond = contrast.pattern, max(beyond, float(contrast.pattern @ z) ** 2)
+    if law.contrasts is not None and contrast is not None:
+        pattern = law.contrasts.clearest(z).pattern
+        beyond = max(beyond, float(pattern @ z) ** 2)
     order = sorted(cells, key=lambda cell: -float(pattern @ residuals[cell]))
-    return Together(cell=host, p=p, worst=worst, z=most, cells=tuple(order), alike=True, excess=beyond)
+    return Together(
+        cell=host, p=p, worst=worst, z=most, cells=tuple(order), alike=True, excess=beyond, contrast=contrast
+    )
 
 
 def _law_of_sums(evaluation: Evaluation, cells: Sequence[Cell]) -> Null:
@@ -174,7 +179,14 @@ def _along_contrasts(
     first = residuals[order[0]]
     worst = int(np.argmax(np.sign(sums[k]) * known[order[0]].patterns[k] * first))
     return Together(
-        cell=host, p=p, worst=worst, z=float(first[worst]), cells=tuple(order), alike=True, excess=float(sums[k]) ** 2
+        cell=host,
+        p=p,
+        worst=worst,
+        z=float(first[worst]),
+        cells=tuple(order),
+        alike=True,
+        excess=float(sums[k]) ** 2,
+        contrast=k,
     )
 
 

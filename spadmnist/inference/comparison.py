@@ -258,11 +258,11 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
                 if least is not None and least.p >= judged.p_value:
                     least = None
                 if least is not None:
-                    judged = replace(judged, p_value=least.p, worst=least.worst)
+                    judged = replace(judged, p_value=least.p, worst=least.worst, contrast=least.contrast)
                 measured, expected = float(summary.values[judged.worst]), float(judged.expected[judged.worst])
                 text, relative = summary.size(judged.worst, measured, expected)
                 misfit = of_cells.get((id, name), judged.misfit)
-                where = summary.where(judged.worst)
+                where = summary.place(judged.worst, judged.contrast)
                 p = max(judged.p_value, LEAST_P)
                 beyond = excess(summary, judged.expected, judged.residuals)
                 if least is not None:

@@ -17,11 +17,12 @@ class Contrast:
     """The clearest contrast of residuals.
 
     Attributes:
-        p: p-value, corrected for the number of contrasts.
+        index: of its pattern; p: p-value, corrected for the number of contrasts.
         pattern: (cells,) of unit length, with the sign of its score.
         worst: the cell that contributes most to the score.
     """
 
+    index: int
     p: float
     pattern: np.ndarray
     worst: int
@@ -64,7 +65,7 @@ class Contrasts:
         scores = self.scores(z)
         p, k = p_of_scores(scores, self.freedom)
         pattern = self.patterns[k] * np.sign(scores[k])
-        return Contrast(p=p, pattern=pattern, worst=int(np.argmax(pattern * z)))
+        return Contrast(index=k, p=p, pattern=pattern, worst=int(np.argmax(pattern * z)))
 
 
 def p_of_scores(scores: np.ndarray, freedom: int) -> tuple[float, int]:

@@ -451,6 +451,7 @@ class BlockCheck:
         worst: the cell that shows it most; z: its residual.
         tests: the number of tests of which p is the smallest p-value.
         together: where p is that of several captures together, their check.
+        contrast: the index of the contrast, where one decides.
     """
 
     cell: Cell
@@ -459,6 +460,7 @@ class BlockCheck:
     z: float
     tests: int = 1
     together: Together | None = None
+    contrast: int | None = None
 
     @property
     def shown(self) -> Cell:
@@ -474,7 +476,7 @@ def block_checks(
     Args:
         residuals: (cells,) by block.
     """
-    out, alone = [], dict[Cell, tuple[float, int]]()
+    out, alone = [], dict[Cell, tuple[float, int, int | None]]()
     for cell, z in residuals.items():
         if cell == TOTALS:
             out += [
@@ -484,15 +486,26 @@ def block_checks(
         else:
             alone[cell] = evaluation.nulls[cell].p_value(z)
     several: dict[Cell, list[Together]] = {}
-    for check in checks_together(replicates, evaluation, residuals, {cell: p for cell, (p, _) in alone.items()}):
+    for check in checks_together(replicates, evaluation, residuals, {cell: p for cell, (p, *_) in alone.items()}):
         several.setdefault(check.cell, []).append(check)
-    for cell, (p, worst) in alone.items():
+    for cell, (p, worst, contrast) in alone.items():
         here = several.get(cell, [])
         least, tests = min(here, key=lambda check: check.p, default=None), 1 + len(here)
         if least is not None and least.p < p:
-            out.append(BlockCheck(cell=cell, p=least.p, worst=least.worst, z=least.z, tests=tests, together=least))
+            out.append(
+                BlockCheck(
+                    cell=cell,
+                    p=least.p,
+                    worst=least.worst,
+                    z=least.z,
+                    tests=tests,
+                    together=least,
+                    contrast=least.contrast,
+                )
+            )
         else:
-            out.append(BlockCheck(cell=cell, p=p, worst=worst, z=float(residuals[cell][worst]), tests=tests))
+            z_worst = float(residuals[cell][worst])
+            out.append(BlockCheck(cell=cell, p=p, worst=worst, z=z_worst, tests=tests, contrast=contrast))
     out += [BlockCheck(cell=cell, p=1e-12, worst=0, z=40.0) for cell in evaluation.exact]
     return sorted(out, key=lambda b: (b.p, -abs(b.z)))
 

@@ -104,7 +104,7 @@ def _failed(
         capture=id,
         excess=beyond,
         worst=block.worst,
-        where=summary.where(block.worst),
+        where=summary.place(block.worst, block.contrast),
         size=relative,
         residuals=z,
         at=at,

@@ -40,7 +40,7 @@ class Judgement:
         misfit: mean squared residual relative to that of the model's replicates (1 is expected).
         residuals: (cells,) standard deviations.
         expected, spread: (cells,) expectation and its scatter, in the summary's unit.
-        worst: the cell that shows the deviation most.
+        worst: the cell that shows the deviation most; contrast: the index of the contrast, where one decides.
     """
 
     p_value: float
@@ -49,6 +49,7 @@ class Judgement:
     expected: np.ndarray
     spread: np.ndarray
     worst: int
+    contrast: int | None = None
 
 
 @dataclass(frozen=True)
@@ -115,14 +116,20 @@ class Null:
                 worst=worst,
             )
         z = self.residuals(values, expected, leverage)
-        p, worst = self.p_value(z)
+        p, worst, contrast = self.p_value(z)
         mean = max(float(self.replicate_squares.mean()), 0.05)
         return Judgement(
-            p_value=p, misfit=float(np.mean(z**2)) / mean, residuals=z, expected=expected, spread=spread, worst=worst
+            p_value=p,
+            misfit=float(np.mean(z**2)) / mean,
+            residuals=z,
+            expected=expected,
+            spread=spread,
+            worst=worst,
+            contrast=contrast,
         )
 
-    def p_value(self, z: np.ndarray) -> tuple[float, int]:
-        """(p-value of residuals, the cell that shows the deviation most).
+    def p_value(self, z: np.ndarray) -> tuple[float, int, int | None]:
+        """(p-value of residuals, the cell that shows the deviation most, the contrast if one decides).
 
         The p-value is twice the smaller of that of the sum of squares and that of the largest residual. Where there are
         contrasts, the sum is of what they do not describe, and the p-value is three times the smallest.
@@ -138,11 +145,11 @@ class Null:
         largest = abs(float(z[worst])) / self.tail
         p_cell = min(1.0, z.size * 2 * float(special.ndtr(-largest)))
         if self.contrasts is None:
-            return min(1.0, 2 * min(p_sum, p_cell)), worst
+            return min(1.0, 2 * min(p_sum, p_cell)), worst, None
         contrast = self.contrasts.clearest(z)
         if contrast.p < min(p_sum, p_cell):
-            return min(1.0, 3 * contrast.p), contrast.worst
-        return min(1.0, 3 * min(p_sum, p_cell)), worst
+            return min(1.0, 3 * contrast.p), contrast.worst, contrast.index
+        return min(1.0, 3 * min(p_sum, p_cell)), worst, None
 
     def moments_of_squares(self, cells: int) -> tuple[float, float]:
         """(mean, variance) of the mean squared residual of so many cells."""

@@ -215,7 +215,7 @@ def _problem(found: Summary) -> tuple[str, str] | None:
         column = getattr(found, name)
         if column is not None and np.shape(column) != values.shape:
             return f"has {name} of shape {np.shape(column)}", f"it has a number for each cell, {values.shape}"
-    if found.contrasts is not None and (bent := _problem_of_contrasts(found.contrasts, values.size)):
+    if found.contrasts is not None and (bent := _problem_of_contrasts(found, values.size)):
         return bent
     if found.scale is not None and not np.all((np.asarray(found.scale) >= 0) & (np.asarray(found.scale) < np.inf)):
         return "has a scale that is negative or not finite", "it is the size of the spread of each cell"
@@ -233,17 +233,19 @@ def _problem(found: Summary) -> tuple[str, str] | None:
     return None
 
 
-def _problem_of_contrasts(contrasts: object, cells: int) -> tuple[str, str] | None:
+def _problem_of_contrasts(found: Summary, cells: int) -> tuple[str, str] | None:
     """(what is wrong with the contrasts of a user's statistic, what is right), or None."""
     right = f"they are (patterns, cells), of {cells} cells, each of unit length and at right angles to the others"
     try:
-        patterns = np.asarray(contrasts, np.float64)
+        patterns = np.asarray(found.contrasts, np.float64)
     except (TypeError, ValueError):
         return "has contrasts that are no array of numbers", right
     if patterns.ndim != 2 or patterns.shape[1] != cells or not len(patterns):
         return f"has contrasts of shape {patterns.shape}", right
     if not np.allclose(patterns @ patterns.T, np.eye(len(patterns)), atol=1e-6):
         return "has contrasts that are not of unit length, or not at right angles", right
+    if len(found.contrast_words) != len(patterns):
+        return f"has {len(found.contrast_words)} contrast_words", f"each of its {len(patterns)} contrasts has a name"
     return None
 
 

@@ -44,7 +44,7 @@ class Summary:
     columns) where the cells are a map of the array. nested: (cells,) of normal scores of which each is of what the one
     before is of and of more, as counts in windows twice as long: their correlation with that one. contrasts: (patterns,
     cells), orthonormal: a deviation of this pattern is tested by itself, for one that is spread over all cells is lost
-    in the sum of their squares.
+    in the sum of their squares. contrast_words: the name of each, "a rise or a fall".
     """
 
     values: np.ndarray
@@ -58,6 +58,12 @@ class Summary:
     shape: tuple[int, int] | None = None
     nested: np.ndarray | None = None
     contrasts: np.ndarray | None = None
+    contrast_words: Sequence[str] = ()
+
+    def place(self, cell: int, contrast: int | None = None) -> str:
+        """What a cell looks at, in words; as the place where a contrast is clearest, if its index is given."""
+        where = self.where(cell)
+        return where if contrast is None else f"{self.contrast_words[contrast]}, clearest in {where}"
 
     def apart(self) -> Summary:
         """The same, but of a nested cell what it does not share with the one before: cells that are independent."""

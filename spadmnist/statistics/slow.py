@@ -21,7 +21,7 @@ _BLOCKS = 32
 _LENGTHS = (128, 32, 8)  # blocks of the capture
 _HOTTEST = (0.02, 0.05, 0.1, 0.2)  # of the pixels
 _FEWEST = 10  # pixels
-_COURSES = 3  # patterns of a slow course: a rise, a bend, a turn
+_COURSES = ("a rise or a fall over the capture", "a bend over the capture", "a turn over the capture")
 
 
 @jit
@@ -140,7 +140,7 @@ def _block_time(recording: Recording, blocks: int) -> float:
 
 def slow_courses(blocks: int) -> np.ndarray:
     """A rise, a bend and a turn over the blocks, (patterns, blocks): Legendre polynomials, orthonormal."""
-    powers = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, blocks), _COURSES)
+    powers = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, blocks), len(_COURSES))
     return np.asarray(np.linalg.qr(powers)[0].T[1:])
 
 
@@ -205,6 +205,7 @@ class Trend(Statistic):
             axis=(np.arange(blocks) + 0.5) * length,
             label="time, s",
             contrasts=slow_courses(blocks),
+            contrast_words=_COURSES,
         )
 
 
