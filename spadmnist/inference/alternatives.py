@@ -11,7 +11,7 @@ from .replicates import Replicates
 from .results import plain
 from .scan import Scan
 from .signature import residuals_at
-from .trial import Trial, at_end, tie
+from .trial import Trial, at_end, is_open, tie
 
 # alternatives of a step that its answer names, at most; a rule of thumb
 _NAMED = 4
@@ -44,6 +44,9 @@ def _alternative(replicates: Replicates, evaluation: Evaluation, best: Trial, on
     # the evidence for a few odd pixels may be small, because the model with them has wide cells
     most, this = best.evidence, max(one.evidence, one.fall) if one.chips and judged is not evaluation else one.evidence
     near = most - this < tie(most) or (at_end(best) and this > _ALMOST * most)
+    # pixels that were hit at random are a map by another name where nothing shows how they change with time. A map of a
+    # few odd pixels has much less evidence than its fall: it fits every pixel
+    near = near or (best.chips and one.maps is not None and is_open(best) and one.fall > _ALMOST * most)
     return {
         "change": one.candidate.kind,
         "effect": one.candidate.effect,

@@ -15,7 +15,7 @@ from .candidates import Candidate
 from .coordinates import Coordinate, Key, is_edge
 from .evaluation import Evaluation
 from .gauss_newton import Fit
-from .levels import COST_OF_A_PARAMETER, PROMISING
+from .levels import COST_OF_A_PARAMETER, HALF_95, PROMISING
 from .models import Model
 from .replicates import TOTALS, Cell
 from .signature import Signature
@@ -189,6 +189,18 @@ def at_end(one: Trial) -> bool:
         isinstance(x, (int, float)) and any(math.isclose(x, end, rel_tol=1e-6) for end in (d.low, d.high))
         for d, x in shapes.items()
     )
+
+
+def is_open(one: Trial) -> bool:
+    """Whether the data do not exclude an end of the range of a fitted shape, by its 95 % interval."""
+    if one.fit is None:
+        return False
+    shapes, errors = set(one.candidate.shapes), np.sqrt(np.maximum(np.diag(one.fit.covariance), 0.0))
+    for coordinate, u, error in zip(one.fit.coordinates, one.fit.point, errors, strict=True):
+        ends = sorted(coordinate.coordinate(end) for end in (coordinate.low, coordinate.high))
+        if coordinate in shapes and not ends[0] < u - HALF_95 * error < u + HALF_95 * error < ends[1]:
+            return True
+    return False
 
 
 def frequencies_of(candidate: Candidate) -> list[Coordinate]:
