@@ -201,7 +201,7 @@ def test_every_method_is_listed() -> None:
 
 def test_every_name_that_a_comparison_gives_a_check_is_explained() -> None:
     """The names are read off the code that makes the checks; the shares of false alarms are those that it takes."""
-    names = set(re.findall(r'Check\(\s*"(\w+)"', inspect.getsource(comparison))) | set(SHARES)
+    names = set(re.findall(r'Check\(\s*(?:statistic=)?"(\w+)"', inspect.getsource(comparison))) | set(SHARES)
     assert names == set(Check.registry)
     listed = reference.statistic_list()
     for name in names:
