@@ -15,7 +15,7 @@ signature, score_test             the shift of every cell that a candidate makes
 scan, sharper_tests               all candidates with a few replicates; the most significant ones with more
 trial_fits, gauss_newton          fits of one candidate, and of all numbers, with covariance
 map_trials, map_fits              maps of pixels, by empirical Bayes
-mixed_model                       patterns over the array beside pixels that differ at random, as random effects
+mixed_model                       patterns over the array and random differences of pixels, fitted together
 random_pixels, hit_pixels         effects that hit pixels at random
 evidence                          the measure by which fitted models are compared
 held_out, time_blocks             what was left out of a fit: a capture, or every other block of time

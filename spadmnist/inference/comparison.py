@@ -305,9 +305,14 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
 
 
 def _relative(replicates: Replicates, evaluation: Evaluation, check: Together) -> float:
-    """The relative deviation of several captures together: the mean of those that deviate alike, or the clearest."""
-    sizes = []
+    """The relative deviation of several captures together: the mean of those that deviate alike, or the clearest.
+
+    Contrasts may be of captures with other numbers of cells, in which `worst` is no place: these are left out.
+    """
+    sizes, number = [], len(evaluation.judgements[check.clearest].expected)
     for cell in check.cells if check.alike else check.cells[:1]:
+        if len(evaluation.judgements[cell].expected) != number:
+            continue
         summary, expected = replicates.seen[cell[0]].summaries[cell[1]], evaluation.judgements[cell].expected
         sizes.append(summary.size(check.worst, float(summary.values[check.worst]), float(expected[check.worst]))[1])
     return float(np.mean(sizes))
