@@ -7,13 +7,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from labs import bench_of, labs
+from labs import PHOTON, bench_of, labs
 from scipy import stats
 
+import spadmnist as sp
 from spadmnist.inference.captures_together import Together, checks_together
 from spadmnist.inference.evaluation import block_checks, evaluate
 from spadmnist.inference.null_distribution import Null, learn
 from spadmnist.inference.replicates import no_size
+from spadmnist.sensor import Sensor
 from spadmnist.statistics import Summary
 from spadmnist.statistics.slow import slow_courses
 
@@ -118,3 +120,20 @@ def test_right_models_pass_together(swing: float) -> None:
     for bound in (0.5, 0.1, 0.01, 1e-3):
         few = int(np.sum(ps < bound))
         assert stats.binom.sf(few - 1, len(ps), bound) > 1e-6, (bound, few)
+
+
+def test_a_drift_in_captures_with_other_numbers_of_blocks() -> None:
+    """Captures of 100 and 110 frames have 16 blocks, that of 200 has 32; all are one check."""
+    listed = [sp.effects.Detection(pdp=0.5), sp.effects.DeadTime(duration=50e-9), sp.effects.DarkCounts(rate=100.0)]
+    layout = sp.Layout(16, 16, 25e-12, 1.0)
+    drifts = Sensor(layout, [*listed, sp.effects.SourceDrift(slope=0.06)], rules="device")
+    captures = [
+        sp.Capture(
+            f"{n} frames", "qis", wavelength=500e-9, irradiance=light * PHOTON / 25e-12, frames=n, frame_time=2e-6,
+            frame_period=2e-6, relative_uncertainty=0.05,
+        )
+        for n, light in ((100, 4e4), (200, 2e5), (110, 4e4))
+    ]  # fmt: skip
+    found = sp.compare(Sensor(layout, listed, rules="device"), sp.simulate(drifts, captures, seed=3), jobs=1)
+    (one,) = [check for check in found.checks if "a rise or a fall" in check.where and "alike in 3" in check.where]
+    assert one.capture == "200 frames" and 0 < abs(one.relative) < 0.3
