@@ -43,6 +43,7 @@ from .pixel_maps import (
     mean_of,
     median_of,
     outside_bulk,
+    shape_of,
 )
 from .point_process import blur_of
 from .replicates import Replicates
@@ -100,6 +101,7 @@ class _Fitted:
         middle: of the prior, that of most pixels.
         sigma: width of the prior.
         precision: (groups,) of the prior: smaller for odd pixels.
+        shape: (rows, columns) of a map of pixels.
     """
 
     candidate: Candidate
@@ -113,6 +115,7 @@ class _Fitted:
     raw: np.ndarray
     raw_variance: np.ndarray
     precision: np.ndarray
+    shape: tuple[int, int] | None
     middle: float = 0.0
     sigma: float = _FIRST_WIDTH
 
@@ -136,6 +139,7 @@ class _Fitted:
             raw=np.zeros(size),
             raw_variance=np.zeros(size),
             precision=np.full(size, _FIRST_PRECISION),
+            shape=shape_of(start, candidate.per),
         )
 
     def sums(self, pixels: np.ndarray, weight: np.ndarray | float = 1.0) -> np.ndarray:
@@ -231,6 +235,7 @@ class _Fitted:
             sigma=self.sigma,
             low=self.low,
             high=self.high,
+            shape=self.shape,
             of_scene=of_scene,
         )
 
@@ -547,4 +552,5 @@ def fit_blind_times(replicates: Replicates, values: Values, candidate: Candidate
         raw_error=raw_error,
         sigma=width.sigma,
     )
-    return replace(map_, low=low, high=high, likely=(grid, weights), certain=0.0, width=width)
+    shape = shape_of(start, candidate.per)
+    return replace(map_, low=low, high=high, shape=shape, likely=(grid, weights), certain=0.0, width=width)

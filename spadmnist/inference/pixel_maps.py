@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special, stats
+from scipy import ndimage, special, stats
 
 from ..effects import Effect
 from ..sensor import Sensor
@@ -49,6 +49,9 @@ GRID, ROUNDS = (-4.0, 8.0, 97), 100
 RELIABLE, LEAST_RELIABLE = 0.98, 0.04
 # standard deviations of a logarithm, from which on nothing is known of it: of a scene, such a pixel is left out
 NOTHING = 3.0
+# pixels whose median a pixel is compared with to be odd: the nearest ones, lest light that rises along the array hide a
+# hot one. So many that the noise of their median widens the distance by 3 %
+_AROUND = 25
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class PixelMap:
         raw, raw_error: (groups,) the same without the prior.
         sigma: width of the prior.
         low, high: bounds of the values.
+        shape: (rows, columns) of the pixels, where each has a value of its own; None of rows, columns, codes.
     """
 
     carrier: Key
@@ -79,12 +83,33 @@ class PixelMap:
     prior: np.ndarray | None = None  # (grid,) the common law of pixels with few counts, in those weights
     certain: float = INFORMED  # raw_error below which a value is the estimate, whatever the others are
     width: blind_times.Width | None = None  # where the likelihood of all pixels gives it
+    shape: tuple[int, int] | None = None
     of_scene: bool = False  # no light falls on some pixels, and nothing says how much of it they detect
 
     @property
     def informed(self) -> np.ndarray:
         """(groups,) bool: the values that anything is known of."""
         return self.raw_error < NOTHING if self.of_scene else np.ones(self.raw.size, bool)
+
+    def around(self, numbers: np.ndarray) -> np.ndarray:
+        """(groups,) the level of the pixels around each, or of all where they have no places or are few.
+
+        It is a running median, and that of the rest added, lest a slope be an odd pixel at the end of the array.
+        Source: Tukey, Exploratory Data Analysis (1977), chapter 16, "twicing".
+
+        Args:
+            numbers: (groups,) of the map.
+        """
+        if self.shape is None or numbers.size < 2 * _AROUND:
+            return np.full(numbers.size, median_of(numbers))
+        rows = min(self.shape[0], math.isqrt(_AROUND))
+        columns = min(self.shape[1], _AROUND // rows)
+        window = (min(self.shape[0], _AROUND // columns), columns)
+        rest, level = numbers.reshape(self.shape), np.zeros(self.shape)
+        for _ in range(2):
+            middle = ndimage.median_filter(rest, size=window, mode="reflect")
+            rest, level = rest - middle, level + middle
+        return np.asarray(level.ravel())
 
     @property
     def price(self) -> float:
@@ -179,6 +204,11 @@ def groups_of(sensor: Sensor, per: str) -> np.ndarray:
     return pixels
 
 
+def shape_of(sensor: Sensor, per: str) -> tuple[int, int] | None:
+    """(rows, columns) of a map in which each pixel has a value of its own, None of other maps."""
+    return (sensor.layout.rows, sensor.layout.columns) if per == "pixel" else None
+
+
 def mean_of(weights: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(mean, standard deviation) of each row of weights (rows, grid) over a grid, (rows,) each."""
     weights = weights / weights.sum(axis=1, keepdims=True)
@@ -207,10 +237,11 @@ def median_of(x: np.ndarray) -> float:
 
 
 def odd_pixels(map_: PixelMap) -> tuple[np.ndarray, np.ndarray]:
-    """((groups,) bool far below all others, (groups,) bool far above)."""
-    inner = map_.estimate - median_of(map_.estimate)
+    """((groups,) bool far below the pixels around them, (groups,) bool far above)."""
+    around = map_.around(map_.estimate)
+    inner = map_.estimate - around
     # of most pixels: beyond their noise, without the odd ones
-    raw = map_.raw[map_.informed]
+    raw = (map_.raw - around)[map_.informed]
     width = 1.4826 * float(np.median(np.abs(raw - np.median(raw)))) if raw.size else 0.0
     noise = float(np.median(map_.raw_error[map_.informed])) if raw.size else NOTHING
     bulk = math.sqrt(max(width**2 - noise**2, 0.0))
@@ -219,7 +250,7 @@ def odd_pixels(map_: PixelMap) -> tuple[np.ndarray, np.ndarray]:
 
 
 def low_ratio(map_: PixelMap) -> tuple[float, float]:
-    """(mean of the values far below all others, relative to the middle, its standard deviation).
+    """(mean of the values far below those around them, relative to the middle, its standard deviation).
 
     It is (1, inf) if there are none.
     """

@@ -19,7 +19,7 @@ from ..statistics import Statistic
 from .blind_times import width_of
 from .candidates import Candidate, with_values
 from .coordinates import Values
-from .pixel_maps import PixelMap, groups_of, mean_of
+from .pixel_maps import PixelMap, groups_of, mean_of, shape_of
 from .replicates import Replicates
 
 # logarithms of the value relative to the array: the grid on which all pixels are looked for, and how many points cover
@@ -72,7 +72,8 @@ def fit_by_statistic(
         sigma=width.sigma,
     )
     low, high = bounds
-    return replace(map_, low=low, high=high, likely=(grid, weights), certain=0.0, width=width)
+    shape = shape_of(replicates.start, candidate.per)
+    return replace(map_, low=low, high=high, shape=shape, likely=(grid, weights), certain=0.0, width=width)
 
 
 def p_of_width(map_: PixelMap) -> float:

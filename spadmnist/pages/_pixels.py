@@ -26,13 +26,14 @@ if TYPE_CHECKING:
 
 _LISTED = 40  # odd pixels in the page; the file has all
 _FILE = "odd_pixels-{}.csv"  # the list of a map, by the name of its step
-_HEAD = ("row", "column", "value", "unit", "relative_to_median", "kind")
+_HEAD = ("row", "column", "value", "unit", "relative_to_median", "relative_to_surroundings", "kind")
+_EARLIER = ",".join(_HEAD[:5])  # how lists begin, those of earlier versions included
 _HIGH, _LOW = "high", "low"
 
 
 @dataclass(frozen=True)
 class OddPixel:
-    """where: of the pixel; value: with its unit; ratio: to the median of the map; kind: "high" or "low"."""
+    """where: of the pixel; value: with its unit; ratio: to the pixels around it; kind: "high" or "low"."""
 
     where: str
     value: str
@@ -70,8 +71,10 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
     unit = Effect.registry.find(carrier[0]).parameters[carrier[1]].unit if carrier[0] in Effect.registry else ""
     middle = float(np.median(values))
     ratios = values / middle if middle > 0 else np.full(values.size, np.nan)
+    around = fitted.around(values)
+    near = np.divide(values, around, out=np.full(values.size, np.nan), where=around > 0)
     odd = np.flatnonzero(low | high)
-    odd = odd[np.argsort(-np.abs(np.log(np.maximum(np.nan_to_num(ratios[odd], nan=1.0), 1e-9))), kind="stable")]
+    odd = odd[np.argsort(-np.abs(np.log(np.maximum(np.nan_to_num(near[odd], nan=1.0), 1e-9))), kind="stable")]
     table = [
         (
             int(k // shape[1]),
@@ -79,20 +82,21 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
             float(f"{values[k]:.6g}"),
             unit,
             float(f"{ratios[k]:.5g}"),
+            float(f"{near[k]:.5g}"),
             _HIGH if high[k] else _LOW,
         )
         for k in odd
     ]
     rows = [
         OddPixel(f"row {row}, column {column}", _shown(value, unit), ratio, kind)
-        for row, column, value, _, ratio, kind in table[:_LISTED]
+        for row, column, value, _, _, ratio, kind in table[:_LISTED]
     ]
     name = title(step.candidate).removesuffix(" per pixel")
     words = f"Map of {name}: the fitted value of each pixel, relative to the median"
     drawing = ratios.reshape(shape), _shown(middle, unit), odd
     picture = Picture(figures.drawn(_draw_map, *drawing), words)
     sentence = (
-        f"{int(high.sum())} of {values.size:,} pixels lie far above the others and {int(low.sum())} far below; "
+        f"{int(high.sum())} of {values.size:,} pixels lie far above those around them and {int(low.sum())} far below; "
         f"the median is {_shown(middle, unit)}."
     )
     file = _FILE.format(re.sub(r"[^a-z0-9_]+", "-", name.lower()))
@@ -123,8 +127,7 @@ def write_lists(maps: Collection[OddPixels], folder: Path) -> None:
 
 def _is_list(path: Path) -> bool:
     """Whether a file is a list of odd pixels."""
-    head = ",".join(_HEAD).encode()
-    return path.is_file() and not path.is_symlink() and disk.read_file(path, 1 << 30).startswith(head)
+    return path.is_file() and not path.is_symlink() and disk.read_file(path, 1 << 30).startswith(_EARLIER.encode())
 
 
 def _shown(value: float, unit: str) -> str:
