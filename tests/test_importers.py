@@ -321,7 +321,10 @@ def test_linospad2_word_by_word(tmp_path: Path, firmware: str, lines: int, calib
             if pixels:
                 expected.append((pixels[which], c * cycle + seconds(pixels[which], codes)))
     said = Said(firmware=firmware, timestamps=timestamps, cycle=cycle, tdc=tmp_path / "t.csv" if calibrated else None)
-    events = back(run(tmp_path / "a.dat", said)).events
+    made = run(tmp_path / "a.dat", said)
+    listed = "tdc: {resolution: 17.857142857142858 ps, rounding: floor}"
+    assert calibrated != any(listed in note for note in made.notes)
+    events = back(made).events
     assert events is not None and events.tick == pytest.approx(1e-12 if calibrated else 17.857142857e-12, rel=1e-10)
     found = sorted(zip(map(int, events.pixel), map(float, events.times), strict=True))
     assert [pixel for pixel, _ in found] == [pixel for pixel, _ in sorted(expected)]

@@ -6,10 +6,13 @@ import json
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import numpy as np
 import pytest
-from labs import bench_of
+from labs import bench_of, quiet
 
+import spadmnist as sp
 from spadmnist import pages
+from spadmnist.effects import DarkCounts, DeadTime, Detection, Tdc
 from spadmnist.errors import SpadError
 from spadmnist.inference import (
     alternatives,
@@ -26,7 +29,7 @@ from spadmnist.inference.candidates import candidates
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.forward_step import or_as_before
 from spadmnist.inference.map_trials import map_trials_of
-from spadmnist.inference.model_path import begin
+from spadmnist.inference.model_path import begin, rests_on
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.replicates import CannotSimulate, Replicates
 from spadmnist.inference.results import Step, Value, canonical, table
@@ -217,6 +220,37 @@ def test_a_map_that_cannot_be_made_is_none(lab, monkeypatch) -> None:
     assert map_trials_of(look, evaluation, {}) == []
     assert look.untried and all("no map" in entry["why"] for entry in look.untried)
     assert {entry["where"] for entry in look.untried} == {"making a map"}
+
+
+def test_a_later_step_may_add_what_a_map_needs() -> None:
+    """Unequal codes need a converter: their map is tried again once a step has added one, and excluded without it."""
+    effects = [Detection(pdp=0.5), DarkCounts(rate=100.0), DeadTime(duration=50e-9)]
+    sensor = Sensor(sp.Layout(2, 2, 25e-12, 1.0), effects, rules="device")
+    flat = sp.Capture("flat", "tr", exposure=0.1, wavelength=500e-9, irradiance=3e-3, tick=1e-10)
+    data = sp.simulate(sensor.changed(effects=[*effects, Tdc(resolution=1e-10)]), [flat], seed=1)
+    replicates = bench_of((sensor, data), 8)
+    look, converter = quiet(replicates), {("tdc", "resolution"): 1e-10}
+
+    def tried(values: dict[Any, Any]) -> bool:
+        evaluation = evaluate(replicates, values)
+        map_trials_of(look, evaluation, values)
+        return all(entry["effect"] != "tdc_nonlinearity" for entry in look.untried)
+
+    codes = next(c for c in candidates(sensor) if c.effect == "tdc_nonlinearity")
+    assert not tried({}) and look.is_excluded(codes)
+    look.accepted = [next(c for c in candidates(sensor) if c.name == "add tdc")]
+    assert tried(converter) and not look.is_excluded(codes)
+    look.accepted = []
+    assert look.is_excluded(codes)
+    # the map rests on the converter, and jitter on neither
+    path = begin(replicates)
+    path.values = {**converter, ("tdc_nonlinearity", "widths"): np.array([1.0, 1.2]), ("jitter", "sigma"): 1e-10}
+    adds, maps, other = (
+        Step(next(c for c in candidates(sensor) if c.name == f"add {name}"), {}, 1.0, 9.0, "")
+        for name in ("tdc", "tdc_nonlinearity", "jitter")
+    )
+    assert [rests_on(one, adds, path) for one in (adds, maps, other)] == [False, True, False]
+    assert not rests_on(adds, maps, path) and not rests_on(maps, other, path)
 
 
 def test_a_sensor_that_cannot_be_simulated_itself_is_one_error(lab, monkeypatch) -> None:

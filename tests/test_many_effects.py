@@ -291,7 +291,7 @@ def test_a_step_stays_while_another_one_changes_a_number_of_its_effect(lab) -> N
     taken(path, "add jitter", {sigma: 2e-9, tail: 4e-9})
     taken(path, "set jitter.tail_weight", {weight: 0.3})
     first, second = path.steps
-    assert rests_on(second, first) and not rests_on(first, second)
+    assert rests_on(second, first, path) and not rests_on(first, second, path)
     assert sigma in keys_of(first.candidate, path) and weight not in keys_of(first.candidate, path)
     path.values = {**path.values, sigma: 5e-12}  # it explains nothing any more
     path.evaluation = evaluate(path.replicates, path.values)

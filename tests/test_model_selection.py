@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,8 +12,10 @@ import pytest
 from labs import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
 from spadmnist.inference.alternatives import alternatives
+from spadmnist.inference.candidates import candidates
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import point_of
+from spadmnist.inference.elimination import left_in_own_cells
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.evidence import best_of, evidence_of, judge_maps_by_odd_pixels, share_of_counts
 from spadmnist.inference.exact_likelihood import MaximumLikelihood
@@ -220,6 +223,30 @@ def test_what_a_step_leaves_stays(lab, monkeypatch):
     assert another and path.evaluation is closer
     _, _, another = looked_closer(path, monkeypatch, last)
     assert not another and path.evaluation is new
+
+
+# --- own cells ----------------------------------------------------------------------------------------------------
+
+
+def test_a_step_is_judged_by_its_own_cells_alone(lab):
+    """Where the step that explained other cells has gone, these rise: the map still explains its own."""
+    own, other = ("flat", "pixel_map"), ("flat", "codes")
+    step = Step(
+        candidate=next(c for c in candidates(lab()[0]) if c.name == "per_pixel detection.pdp"),
+        values={},
+        misfit=1.0,
+        significance=20.0,
+        material="",
+        template={own: np.array([20.0, 20.0]), other: np.full(50, 0.01)},
+        before={own: np.array([21.0, 19.0]), other: np.zeros(50)},
+    )
+    risen = np.full(50, 30.0)
+    assert left_in_own_cells(step, {own: np.array([0.5, -0.5]), other: risen}, True) < 0
+    assert left_in_own_cells(step, {own: np.array([10.0, 10.0]), other: risen}, True) == pytest.approx(0.82, abs=0.01)
+    assert left_in_own_cells(step, {own: np.array([21.0, 19.0]), other: risen}, True) == math.inf
+    # a fall that is not in its own cells alone counts as well
+    faint = replace(step, before={own: np.array([3.0, 0.0]), other: np.ones(50)})
+    assert left_in_own_cells(faint, {own: np.array([0.0, 0.0]), other: np.full(50, 0.9)}, True) < 0
 
 
 # --- what looks the same -----------------------------------------------------------------------------------------

@@ -84,6 +84,11 @@ class LinoSpad2(Format):
             raise InputError("--tick: without --tdc the ticks are the codes; give --tdc as well, or leave out --tick")
         outside, full = recording.outside, recording.full
         notes = [f"{cycles:,} cycles were joined; the pauses between them are not in the file"]
+        if ends is None:
+            listed = f"tdc: {{resolution: {units.show(tick, 's', 17)}, rounding: floor}}"
+            notes.append(
+                f"its ticks are codes of unequal width; with {listed} in the sensor file their widths are fitted"
+            )
         if uncalibrated:
             notes.append(f"{uncalibrated} pixels are not calibrated by --tdc; their codes are taken as equally long")
         if full:

@@ -50,8 +50,8 @@ def drop_needless(path: ModelPath) -> None:
     replicates = path.replicates
     last = path.steps[-1]
     # what others rest on comes last: it can be dropped once these are
-    for step in sorted(path.steps, key=lambda s: any(rests_on(other, s) for other in path.steps)):
-        if len(path.steps) < 2 or step.phased or any(rests_on(other, step) for other in path.steps):
+    for step in sorted(path.steps, key=lambda s: any(rests_on(other, s, path) for other in path.steps)):
+        if len(path.steps) < 2 or step.phased or any(rests_on(other, step, path) for other in path.steps):
             continue
         if step is last and not step.on_rough_fit:
             continue
@@ -176,7 +176,7 @@ def _fit_from_templates(path: ModelPath) -> None:
     for step in path.steps:
         if not step.candidate.shapes or step.candidate.carrier or step.phased or step.fluctuates or step.chips:
             continue
-        if any(rests_on(other, step) for other in path.steps):
+        if any(rests_on(other, step, path) for other in path.steps):
             continue
         before, steps = path.kept(), path.steps
         path.steps = [other for other in steps if other is not step]
@@ -228,7 +228,7 @@ def drop_unexplaining(path: ModelPath, start: Evaluation, totals: bool) -> None:
             mean_misfit(evaluation.replicate_residuals, evaluation.residuals) for evaluation in (path.evaluation, start)
         )
         mostly = len(path.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
-        kept = [s for s in path.steps if not (s is worst or rests_on(s, worst)) or left[id(worst)] < 1 or mostly]
+        kept = [s for s in path.steps if not (s is worst or rests_on(s, worst, path)) or left[id(worst)] < 1 or mostly]
         if now > then:
             kept = []
         if len(kept) == len(path.steps):
@@ -281,11 +281,13 @@ def left_in_own_cells(step: Step, residuals: Mapping[Cell, np.ndarray], totals: 
     score = t**2
     if score.sum() <= 0:
         return math.inf
-    fell = before**2 - now**2
-    # of totals alone, any effect may be the cause
-    if fell[shapes].sum() < LEAST_EVIDENCE or score[shapes].sum() < 0.5 * score.sum():
-        return math.inf
+    fell = np.where(shapes, before**2 - now**2, 0.0)
     order = np.argsort(-score, kind="stable")
     own = order[: int(np.searchsorted(np.cumsum(score[order]), OWN_CELLS * score.sum())) + 1]
+    # the fall of a faint one is in all of its cells; in the others, another step may have made it a rise
+    explained = max(float(fell.sum()), float(fell[own].sum()))
+    # of totals alone, any effect may be the cause
+    if explained < LEAST_EVIDENCE or score[shapes].sum() < 0.5 * score.sum():
+        return math.inf
     left, excess = float(np.mean(now[own] ** 2)) - 1, float(np.mean(before[own] ** 2)) - 1
     return left / max((1 - LEAST_FALL) * excess, _NOISE * math.sqrt(2 / len(own)))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from ..errors import SpadError
 from . import count_model, held_out, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Coordinate, Key
@@ -205,6 +206,14 @@ class ModelPath:
             return PixelsHit(hit, of_pixels(sensor, effect, hit))
         return None
 
+    def can_be(self, effects: Collection[str]) -> bool:
+        """Whether the stated sensor can be made with the values that the steps gave to some effects alone."""
+        try:
+            with_values(self.replicates.start, {key: x for key, x in self.values.items() if key[0] in effects})
+        except SpadError:
+            return False
+        return True
+
     def last_rung(self) -> None:
         """Replace the last row of the error budget by the model as it is now."""
         last = self.ladder.pop()
@@ -312,6 +321,9 @@ def _own_keys(candidate: Candidate) -> set[Key]:
     return {(candidate.effect, candidate.parameter or ""), *(d.key for d in candidate.coordinates)}
 
 
-def rests_on(step: Step, other: Step) -> bool:
-    """Whether a step changes a parameter of the effect that the other one has added: without it, it says nothing."""
-    return step is not other and other.candidate.kind == "add" and step.candidate.effect == other.candidate.effect
+def rests_on(step: Step, other: Step, path: ModelPath) -> bool:
+    """Whether a step changes an effect that the other one has added, or needs that effect in the sensor."""
+    if step is other or other.candidate.kind != "add":
+        return False
+    effect, needed = step.candidate.effect, other.candidate.effect
+    return effect == needed or (path.can_be({effect, needed}) and not path.can_be({effect}))

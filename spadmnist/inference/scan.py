@@ -83,7 +83,8 @@ class Scan:
         self._periodic = PeriodicSignatures()
 
         self.untried: list[dict[str, Any]] = []  # candidates that cannot be simulated: which, where, why
-        self._out: set[str] = set()  # names of those that are excluded from now on
+        # (name, effects of the steps) of those that are excluded: a later step may add what one of them needs
+        self._out: set[tuple[str, frozenset[str]]] = set()
         for name in Effect.registry:
             plugged = plugins.is_from_file(Effect.registry.find(name)) and replicates.start.effect(name) is None
             if plugged and all(candidate.effect != name for candidate in replicates.candidates(replicates.start)):
@@ -100,17 +101,21 @@ class Scan:
             self.untried.append(entry)
 
     def exclude(self, candidate: Candidate, where: str, why: str) -> None:
-        """Exclude a candidate: it cannot be simulated with this model, or at its best values."""
-        self._out.add(candidate.name)
+        """Exclude a candidate from this model: it cannot be simulated with it, or at its best values."""
+        self._out.add((candidate.name, self._added))
         self.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why)
 
     def is_excluded(self, candidate: Candidate) -> bool:
-        """Whether a candidate is excluded."""
-        return candidate.name in self._out
+        """Whether a candidate is excluded from this model; a model with other effects may have what it needs."""
+        return (candidate.name, self._added) in self._out
+
+    @property
+    def _added(self) -> frozenset[str]:
+        return frozenset(candidate.effect for candidate in self.accepted)
 
     def candidates(self, sensor: Sensor) -> list[Candidate]:
         """The candidates of a sensor without those that are excluded."""
-        return [candidate for candidate in self.replicates.candidates(sensor) if candidate.name not in self._out]
+        return [candidate for candidate in self.replicates.candidates(sensor) if not self.is_excluded(candidate)]
 
     @contextlib.contextmanager
     def if_possible(self, candidate: Candidate, where: str, wholly: bool = True) -> Iterator[None]:
@@ -126,6 +131,10 @@ class Scan:
                 self.exclude(candidate, where, why(error))
             else:
                 self.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why(error))
+            return
+        if wholly:  # what an earlier model could not do, this one can
+            done = candidate.kind, candidate.effect, candidate.parameter, where
+            self.untried = [e for e in self.untried if (e["change"], e["effect"], e["parameter"], e["where"]) != done]
 
     # --- looking -------------------------------------------------------------------------------------------------
 
