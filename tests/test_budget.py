@@ -160,6 +160,7 @@ def test_a_budget_ends_a_search_and_the_answer_says_so(lab, few, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_numbers_have_errors_of_their_own_where_the_budget_ends_their_fit(lab, few, monkeypatch):
     """Those of the rough fit are a half of them or less."""
     made = lab(AFTERPULSING + "    crosstalk: {probability: 3 %}\n")

@@ -78,6 +78,7 @@ def test_a_short_gate_is_found_by_its_trace_in_the_dark():
 
 
 @pytest.mark.slow
+@pytest.mark.long  # another effect of the same simulator is found by the test before
 def test_crosstalk_is_found():
     found, truth = found_in("open-tr-crosstalk")
     assert found.steps[0].candidate.effect == "crosstalk"

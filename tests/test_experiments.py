@@ -381,6 +381,7 @@ def judge(results: Sequence[Mapping[str, Any]]) -> None:
 
 @with_torch
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not MNIST.is_dir(), reason=f"MNIST's four files are not in {MNIST}")
 def test_a_quick_run_on_mnist(tmp_path: Path) -> None:
     words = ["--quick", "--images-dir", MNIST, "--json"]

@@ -384,6 +384,7 @@ def test_likelihood_and_simulation_agree_on_the_command_line(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):
     """The only other place that a switch has is the wrong one."""
     sensor, captures, map_ = made

@@ -127,13 +127,13 @@ STAGES: dict[str, tuple[Any, str, bool]] = {
 SIMULATED_BEFORE = ("accepting", "all together")  # for its evidence: then it is a step, with the values fitted before
 
 
-def every_other(stages: Iterable[str]) -> list[Any]:
-    """The stages, every second one `long`: each is a diagnosis, and all take the same way out."""
-    return [pytest.param(stage, marks=pytest.mark.long if k % 2 else ()) for k, stage in enumerate(stages)]
+def one_in_four(stages: Iterable[str]) -> list[Any]:
+    """The stages, the others `long`: each is a diagnosis, and all take the same way out."""
+    return [pytest.param(stage, marks=pytest.mark.long if k % 4 else ()) for k, stage in enumerate(stages)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", every_other(STAGES))
+@pytest.mark.parametrize("stage", one_in_four(STAGES))
 def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) -> None:
     """Afterpulsing is what lacks; at one stage it cannot be simulated any more."""
     sensor, data = lab(f"    {_AFTER}")
@@ -174,7 +174,7 @@ FAILING: dict[str, tuple[Any, str, bool]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", every_other(FAILING))
+@pytest.mark.parametrize("stage", one_in_four(FAILING))
 def test_an_answer_is_given_whatever_is_raised_beside_the_steps(stage: str, lab, monkeypatch) -> None:
     """found: is the step that lacks found all the same? What is raised while the best is chosen is laid to that one."""
     sensor, data = lab(f"    {_AFTER}")

@@ -114,6 +114,7 @@ def test_pixels_that_cannot_be_are_refused(
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_what_blinks_is_fitted_by_its_own_scatter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The squares of the pixels that are hit lead elsewhere; the other shapes are tried, and the likelihood decides."""
     replicates = bench_of(camera(tmp_path), 16)

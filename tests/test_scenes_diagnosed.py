@@ -131,8 +131,8 @@ def test_what_happens_where_no_light_falls_is_no_pattern_of_the_light() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "modality"),
-    [  # each effect in one of the two; `long`: in the other, too
-        pytest.param(one, modality, marks=pytest.mark.long if (n + k) % 2 else ())
+    [  # every second effect in one of the two; `long`: all effects, in both
+        pytest.param(one, modality, marks=pytest.mark.long if (n + k) % 4 else ())
         for k, modality in enumerate(("qis", "tr"))
         for n, one in enumerate((*PRINTS, *OTHERS))
     ],
@@ -150,7 +150,7 @@ def test_what_is_hidden_in_a_scene_is_named(hidden: Any, modality: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("modality", ["qis", "tr"])
+@pytest.mark.parametrize("modality", ["qis", pytest.param("tr", marks=pytest.mark.long)])
 def test_a_right_model_of_a_scene_is_quiet(modality: str) -> None:
     """Of 20 comparisons with a right model, each wrong once in a hundred times, 6 are wrong once in 30 million."""
     verdicts = [compare(*lab(seed=seed, modality=modality, frames=1500), jobs=2).verdict for seed in range(20)]

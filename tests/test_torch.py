@@ -129,7 +129,7 @@ WORKERS = [
     pytest.param("fork", False, id="fork"),
     pytest.param("fork", True, id="fork, kept"),
     pytest.param("spawn", True, id="spawn, kept", marks=pytest.mark.slow),
-    pytest.param("forkserver", False, id="forkserver", marks=pytest.mark.slow),
+    pytest.param("forkserver", False, id="forkserver", marks=[pytest.mark.slow, pytest.mark.long]),
 ]
 
 
