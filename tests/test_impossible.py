@@ -26,8 +26,9 @@ from spadmnist.inference import (
     upper_limits,
 )
 from spadmnist.inference.candidates import candidates
+from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.evaluation import evaluate
-from spadmnist.inference.forward_step import or_as_before
+from spadmnist.inference.forward_step import best_added, or_as_before
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import begin, rests_on
 from spadmnist.inference.model_selection import diagnose
@@ -251,6 +252,33 @@ def test_a_later_step_may_add_what_a_map_needs() -> None:
     )
     assert [rests_on(one, adds, path) for one in (adds, maps, other)] == [False, True, False]
     assert not rests_on(adds, maps, path) and not rests_on(maps, other, path)
+
+
+def test_what_cannot_be_fitted_as_a_step_is_tried_once(monkeypatch) -> None:
+    """A map is made anew for every look: it is excluded from the model that it was added to, lest there be no end."""
+    gains = np.exp(np.random.default_rng(2).normal(0, 0.5, 16))
+    detection, others = Detection(pdp=0.3), [DarkCounts(rate=100.0), DeadTime(duration=50e-9)]
+    sensor = Sensor(sp.Layout(4, 4, 25e-12, 1.0), [detection, *others], rules="device")
+    hidden = sensor.changed(effects=[Detection(pdp=0.3, relative=gains), *others])
+    flat = sp.Capture("flat", "tr", exposure=0.1, wavelength=500e-9, irradiance=3e-3)
+    path, notes, taken = begin(bench_of((sensor, sp.simulate(hidden, [flat], seed=1)), 8)), Notes([], False), []
+
+    def fails(path: Any, best: Any, significance: float) -> Any:
+        taken.append(best.candidate.name)
+        assert len(taken) < 20
+        path.scan.accepted += best.candidates
+        raise SpadError("its light has no level")
+
+    monkeypatch.setattr(forward_step, "accept", fails)
+    notes.tried = path.scan.scan(path.evaluation)
+    best_added(path, notes, path.failed)
+    assert (
+        not path.steps
+        and "per_pixel detection.pdp" in taken
+        and len(set(taken)) == len(taken)
+        and not path.scan.accepted
+    )
+    assert any(e["effect"] == "detection" and "no level" in e["why"] for e in path.scan.untried)
 
 
 def test_a_sensor_that_cannot_be_simulated_itself_is_one_error(lab, monkeypatch) -> None:

@@ -171,26 +171,64 @@ def test_nobody_knows_exactly_how_wide_pixels_lie() -> None:
     assert clear.values(draw, 2.0) == pytest.approx(clear.values(draw, 0.0), rel=1e-4)
 
 
+def placed(raw: np.ndarray, shape: tuple[int, int] | None, noise: float = 0.045) -> PixelMap:
+    """A map whose values are the data themselves."""
+    error = np.full(raw.size, noise)
+    return PixelMap(("a", "b"), 1.0, np.arange(raw.size), raw, error, raw, error, 0.5, shape=shape)
+
+
 @pytest.mark.parametrize("shape", [(1, 256), (256, 1), (32, 32)])
 def test_a_hot_pixel_in_light_that_rises_along_the_array_is_odd(shape: tuple[int, int]) -> None:
     """A pixel is compared with those around it: one of three times their rate is no brighter than the far end.
 
-    Noise of 4.5 %: of 16,384 others, 4 are beyond four sigma of what is around them, or 5 (measured, with the slope).
-    Compared with all of the array, no hot one is odd.
+    Of 16,384 others, one is beyond four sigma of all, or five of what is around it. Compared with all, none is odd.
     """
     rng, n = np.random.default_rng(8), math.prod(shape)
     places = np.arange(n) if min(shape) == 1 else np.arange(n) // shape[1] + np.arange(n) % shape[1]
     rising, wrong = np.log(1 + 4 * places / places.max()), 0
-    for hot in rng.permutation(n // 8)[: 16_384 // n]:
-        raw, noise = rising + rng.normal(0, 0.045, n), np.full(n, 0.045)
+    inner = np.flatnonzero(np.isfinite(placed(rising, shape).around[: n // 4]))
+    for hot in rng.choice(inner, 16_384 // n):
+        raw = rising + rng.normal(0, 0.045, n)
         raw[hot] += math.log(3)
         raw[200] -= 6  # a dead one
-        map_ = PixelMap(("a", "b"), 1.0, np.arange(n), raw, noise, raw, noise, 0.5, shape=shape)
-        low, high = odd_pixels(map_)
+        low, high = odd_pixels(placed(raw, shape))
         assert high[hot] and low[200]
         wrong += int(low.sum() + high.sum()) - 2
-        assert not odd_pixels(replace(map_, shape=None))[1][hot]
-    assert wrong <= 18  # of 5, by the Poisson law, 1e-6
+        assert not odd_pixels(placed(raw, None))[1][hot]
+    assert wrong <= 9  # of one, by the Poisson law, 1e-7
+
+
+@pytest.mark.parametrize("shape", [(1, 256), (16, 16), (32, 32), (3, 64)])
+def test_light_that_is_not_even_makes_no_pixel_odd(shape: tuple[int, int]) -> None:
+    """A loss to the corners; two converters that differ by a factor of two from column to column."""
+    rng, places = np.random.default_rng(9), np.indices(shape)
+    y, x = (2 * at / at.max() - 1 if at.max() > 2 else 0.0 * at for at in places)
+    for level in (-2 * x**2, -(x**2) - y**2, np.log(2) * (places[1] % 2)):
+        odd = 0
+        for _ in range(20_000 // math.prod(shape)):
+            low, high = odd_pixels(placed((level + rng.normal(0, 0.045, shape)).ravel(), shape))
+            odd += int(low.sum() + high.sum())
+        assert odd <= 11  # of two in 20,000, by the Poisson law, 1e-6
+
+
+def test_dead_rows_and_hot_blocks_are_odd_and_do_not_widen_the_rest() -> None:
+    """What lies around them is as odd: they are compared with all."""
+    for shape, where in (
+        ((32, 32), np.s_[10:13]),
+        ((32, 32), np.s_[:2]),
+        ((32, 32), np.s_[4:8, 4:8]),
+        ((1, 256), np.s_[:, 100:116]),
+        ((1, 256), np.s_[:, -8:]),
+    ):
+        for by, share in ((-6.0, "low_fraction"), (4.0, "high_fraction")):
+            raw = np.random.default_rng(10).normal(0, 0.1, shape)
+            raw[where] += by
+            found = summary(placed(raw.ravel(), shape))
+            assert found[share] == raw[where].size / raw.size and found["sigma"] == pytest.approx(0.09, abs=0.02)
+    # a low one is relative to what it is compared with
+    rising = np.log(1 + 4 * np.arange(256) / 255)
+    rising[[180, 200, 220]] += math.log(0.5)
+    assert summary(placed(rising, (1, 256), 0.01))["low_ratio"] == pytest.approx(0.5, abs=0.02)
 
 
 ANOTHER = """format: spadmnist-measurement/1

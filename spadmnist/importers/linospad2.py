@@ -87,7 +87,7 @@ class LinoSpad2(Format):
         if ends is None:
             listed = f"tdc: {{resolution: {units.show(tick, 's', 17)}, rounding: floor}}"
             notes.append(
-                f"its ticks are codes of unequal width; with {listed} in the sensor file their widths are fitted"
+                f"its stamps are codes of unequal width; with {listed} in the sensor file the widths are fitted"
             )
         if uncalibrated:
             notes.append(f"{uncalibrated} pixels are not calibrated by --tdc; their codes are taken as equally long")

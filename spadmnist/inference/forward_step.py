@@ -56,7 +56,22 @@ def record_end(path: ModelPath, where: str) -> None:
 
 
 class _NoCandidate(Exception):
-    """The best candidate cannot be simulated, so that it is excluded."""
+    """Candidates cannot be simulated.
+
+    Args:
+        candidates: are to be excluded from the model that they were added to.
+        where, why: as in `Scan.exclude`.
+    """
+
+    def __init__(self, candidates: Sequence[Candidate], where: str = "", why: str = ""):
+        super().__init__(why)
+        self.candidates, self.where, self.why = tuple(candidates), where, why
+
+    def exclude_from(self, path: ModelPath, before: Any) -> None:
+        """Restore the path as it was before the candidates were steps, and exclude them from that model."""
+        path.back_to(before)
+        for candidate in self.candidates if self.where else ():
+            path.scan.exclude(candidate, self.where, self.why)
 
 
 def best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float = FALSE_ALARM) -> bool:
@@ -72,21 +87,21 @@ def best_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], leas
         before = path.kept()
         try:
             return best_of_scan_added(path, notes, failed, least)
-        except _NoCandidate as none:
-            names = none.args[0]
+        except _NoCandidate as one:
+            none = one
         except UNABLE as error:  # not attributable to one candidate: the one with the largest fall is excluded
             most = max(notes.tried, key=lambda t: t.fall, default=None)
             if most is None:
                 raise
-            path.scan.exclude(most.candidate, "choosing the best", why(error))
-            names = {most.candidate.name}
-        path.back_to(before)
+            none = _NoCandidate([most.candidate], "choosing the best", why(error))
+        none.exclude_from(path, before)
+        names = {candidate.name for candidate in none.candidates}
         notes.tried = [t for t in notes.tried if t.candidate.name not in names]
 
 
 @contextlib.contextmanager
-def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Iterator[None]:
-    """A context without which candidates are excluded.
+def _needed(candidates: Sequence[Candidate], where: str) -> Iterator[None]:
+    """A context without which candidates are to be excluded.
 
     Raises:
         _NoCandidate: where they cannot be simulated.
@@ -94,9 +109,7 @@ def _needed(path: ModelPath, candidates: Sequence[Candidate], where: str) -> Ite
     try:
         yield
     except UNABLE as error:
-        for candidate in candidates:
-            path.scan.exclude(candidate, where, why(error))
-        raise _NoCandidate({candidate.name for candidate in candidates}) from error
+        raise _NoCandidate(candidates, where, why(error)) from error
 
 
 def best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], least: float) -> bool:
@@ -154,7 +167,7 @@ def best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChec
         record_end(path, f"step {len(path.steps) + 1}")
         return False
     if not able and not refused:
-        raise _NoCandidate({one.candidate.name for one in seen})
+        raise _NoCandidate([one.candidate for one in seen])  # each was excluded when it was tried
     if doubtful is not None:
         path.back_to(doubtful)
     elif not (faint or refused) and has_few_replicates(path):
@@ -187,12 +200,16 @@ def added_from(path: ModelPath, notes: Notes, failed: Sequence[BlockCheck], wait
         group = _with_rivals(path, group, others)
         if not group:
             break
-        with contextlib.suppress(_NoCandidate, *UNABLE):  # the scan that follows records what cannot be simulated
+        try:
             found = _best_of(path, notes, None, fitted_trials(path, group, False), False)
             if found is not None and found[2] <= FALSE_ALARM and found[0].evidence >= LEAST_EVIDENCE:
                 best, significance, _ = found
                 if leads(best, notes.waiting) and _taken(path, notes, failed, group, best, significance):
                     return True
+        except _NoCandidate as none:
+            none.exclude_from(path, earlier)
+        except UNABLE:  # the scan that follows records what cannot be simulated
+            pass
         path.back_to(earlier)
     notes.waiting = []
     return False
@@ -297,7 +314,7 @@ def _taken(
     """
     scan, faint = path.scan, not failed
     before, earlier, fell = path.evaluation, path.kept(), path.misfit
-    with _needed(path, best.candidates, "fitting all numbers together"):
+    with _needed(best.candidates, "fitting all numbers together"):
         new = accept(path, best, significance)
     if best.maps is None and not best.phases:
         with or_as_before(path, "trying random maps with the same signature"):
@@ -309,10 +326,10 @@ def _taken(
         with contextlib.suppress(*UNABLE):  # no result depends on it
             notes.placebo = placebo_of(path.replicates, before, notes.tried, best, named)
     if faint:
-        with _needed(path, best.candidates, "fitting all numbers together"):
+        with _needed(best.candidates, "fitting all numbers together"):
             complete(path)  # what no check shows is decided by the fit of all numbers
     if not failed and path.failed and has_few_replicates(path):
-        with _needed(path, best.candidates, "a closer look"):
+        with _needed(best.candidates, "a closer look"):
             path.evaluation = with_more_replicates(path)  # with as many replicates as the model without the step
     if not failed and path.failed:
         path.back_to(earlier)  # no check failed before, now one does
@@ -325,7 +342,7 @@ def _taken(
         return not explains and more and fell - path.misfit < _LEAST_FALL_OF_MISFIT * (fell - 1)
 
     if helps_too_little():
-        with _needed(path, best.candidates, "fitting all numbers together"):
+        with _needed(best.candidates, "fitting all numbers together"):
             complete(path)  # a rough fit may be all that is wrong with it
         if helps_too_little():
             if path.misfit > fell:

@@ -69,7 +69,7 @@ def map_trials_of(
     out = []
     for group in groups:
         made: tuple[Any, ...] = ()
-        with scan.if_possible(group[0], MAKING_A_MAP):
+        with scan.if_possible(group[0], MAKING_A_MAP) if len(group) == 1 else contextlib.suppress(*UNABLE):
             made = map_models.models_with_maps(scan.replicates, values, [*held, *group], levels)
         if not made:
             continue

@@ -323,7 +323,7 @@ def _own_keys(candidate: Candidate) -> set[Key]:
 
 def rests_on(step: Step, other: Step, path: ModelPath) -> bool:
     """Whether a step changes an effect that the other one has added, or needs that effect in the sensor."""
-    if step is other or other.candidate.kind != "add":
-        return False
     effect, needed = step.candidate.effect, other.candidate.effect
-    return effect == needed or (path.can_be({effect, needed}) and not path.can_be({effect}))
+    if effect == needed:
+        return step is not other and other.candidate.kind == "add"
+    return path.can_be({effect, needed}) and not path.can_be({effect})

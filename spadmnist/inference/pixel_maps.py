@@ -49,9 +49,12 @@ GRID, ROUNDS = (-4.0, 8.0, 97), 100
 RELIABLE, LEAST_RELIABLE = 0.98, 0.04
 # standard deviations of a logarithm, from which on nothing is known of it: of a scene, such a pixel is left out
 NOTHING = 3.0
-# pixels whose median a pixel is compared with to be odd: the nearest ones, lest light that rises along the array hide a
-# hot one. So many that the noise of their median widens the distance by 3 %
-_AROUND = 25
+# pixels along a line, or along each side of a square, whose median a pixel is compared with besides that of all, lest
+# light that rises along the array hide a hot one. The median of 25 widens the distance by 3 % for a normal law
+_LINE, _SQUARE = 25, 5
+# standard deviations from all pixels, and from those around it, beyond which a pixel is odd; and the least distance. Of
+# normal pixels these are 6e-5 and at most 2e-5
+_BEYOND, _BEYOND_NEAR, _LEAST_BEYOND = 4.0, 5.0, 0.15
 
 
 @dataclass(frozen=True)
@@ -91,25 +94,51 @@ class PixelMap:
         """(groups,) bool: the values that anything is known of."""
         return self.raw_error < NOTHING if self.of_scene else np.ones(self.raw.size, bool)
 
-    def around(self, numbers: np.ndarray) -> np.ndarray:
-        """(groups,) the level of the pixels around each, or of all where they have no places or are few.
+    @functools.cached_property
+    def around(self) -> np.ndarray:
+        """(groups,) the median logarithm of the pixels around each; NaN near an end, and of maps without places.
 
-        It is a running median, and that of the rest added, lest a slope be an odd pixel at the end of the array.
-        Source: Tukey, Exploratory Data Analysis (1977), chapter 16, "twicing".
-
-        Args:
-            numbers: (groups,) of the map.
+        They lie alike on both sides of the pixel, so that a slope does not matter.
         """
-        if self.shape is None or numbers.size < 2 * _AROUND:
-            return np.full(numbers.size, median_of(numbers))
-        rows = min(self.shape[0], math.isqrt(_AROUND))
-        columns = min(self.shape[1], _AROUND // rows)
-        window = (min(self.shape[0], _AROUND // columns), columns)
-        rest, level = numbers.reshape(self.shape), np.zeros(self.shape)
-        for _ in range(2):
-            middle = ndimage.median_filter(rest, size=window, mode="reflect")
-            rest, level = rest - middle, level + middle
-        return np.asarray(level.ravel())
+        out = np.full(self.estimate.size, np.nan)
+        if self.shape is None or self.of_scene:
+            return out
+        if min(self.shape) >= 2 * _SQUARE:
+            window = (_SQUARE, _SQUARE)
+        elif max(self.shape) >= 2 * _LINE:
+            window = (1, _LINE) if self.shape[1] > self.shape[0] else (_LINE, 1)
+        else:
+            return out
+        medians = ndimage.median_filter(self.estimate.reshape(self.shape), size=window)
+        inner = tuple(slice(n // 2, size - n // 2) for n, size in zip(window, self.shape, strict=True))
+        out.reshape(self.shape)[inner] = medians[inner]
+        return out
+
+    @functools.cached_property
+    def odd(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """((groups,) bool far below, (groups,) bool far above, (groups,) the logarithm that each is compared with).
+
+        A pixel is far from all others, or from those around it; the latter counts where the former does not hold.
+        """
+        level = np.full(self.estimate.size, median_of(self.estimate))
+        far = np.abs(self.estimate - level) > self._far(level, _BEYOND)
+        around = self.around
+        some = np.isfinite(around) & ~far
+        near = np.zeros(far.size, bool)
+        if some.any():
+            near = some & (np.abs(self.estimate - around) > self._far(around, _BEYOND_NEAR))
+        level = np.where(near, around, level)
+        beyond = self.estimate - level
+        return (far | near) & (beyond < 0), (far | near) & (beyond > 0), level
+
+    def _far(self, level: np.ndarray, times: float) -> np.ndarray:
+        """(groups,) the distance from a level beyond which a value is odd: that of most pixels beyond their noise."""
+        known = self.informed & np.isfinite(level)
+        raw = self.raw[known] - level[known]
+        width = 1.4826 * float(np.median(np.abs(raw - np.median(raw)))) if raw.size else 0.0
+        noise = float(np.median(self.raw_error[known])) if raw.size else NOTHING
+        bulk = math.sqrt(max(width**2 - noise**2, 0.0))
+        return np.maximum(times * np.sqrt(bulk**2 + self.raw_error**2), _LEAST_BEYOND)
 
     @property
     def price(self) -> float:
@@ -237,29 +266,22 @@ def median_of(x: np.ndarray) -> float:
 
 
 def odd_pixels(map_: PixelMap) -> tuple[np.ndarray, np.ndarray]:
-    """((groups,) bool far below the pixels around them, (groups,) bool far above)."""
-    around = map_.around(map_.estimate)
-    inner = map_.estimate - around
-    # of most pixels: beyond their noise, without the odd ones
-    raw = (map_.raw - around)[map_.informed]
-    width = 1.4826 * float(np.median(np.abs(raw - np.median(raw)))) if raw.size else 0.0
-    noise = float(np.median(map_.raw_error[map_.informed])) if raw.size else NOTHING
-    bulk = math.sqrt(max(width**2 - noise**2, 0.0))
-    beyond = np.maximum(4 * np.sqrt(bulk**2 + map_.raw_error**2), 0.15)
-    return inner < -beyond, inner > beyond
+    """((groups,) bool far below all others or those around them, (groups,) bool far above)."""
+    low, high, _ = map_.odd
+    return low, high
 
 
 def low_ratio(map_: PixelMap) -> tuple[float, float]:
-    """(mean of the values far below those around them, relative to the middle, its standard deviation).
+    """(mean of the low values, each relative to what it is compared with, its standard deviation).
 
     It is (1, inf) if there are none.
     """
-    low, _ = odd_pixels(map_)
+    low, _, level = map_.odd
     if not low.any():
         return 1.0, math.inf
     # pixels that are informed by themselves: the prior pulls an estimate to the others
     informed = map_.raw_error < INFORMED
-    logs = np.where(informed, map_.raw, map_.estimate)[low] - median_of(map_.estimate)
+    logs = np.where(informed, map_.raw, map_.estimate)[low] - level[low]
     own = float(np.mean(np.where(informed, map_.raw_error, map_.error)[low] ** 2))
     apart = float(np.var(logs, ddof=1)) if low.sum() > 1 else 0.0
     mean = float(np.exp(logs).mean())

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 # the values of a map, by name, in words
 OF_A_MAP = {
     "sigma": "relative spread of the bulk of the pixels",
-    "low_fraction": "share of pixels that lie far below those around them",
-    "low_ratio": "mean of these, relative to the middle of all",
-    "high_fraction": "share of pixels that lie far above those around them",
+    "low_fraction": "share of pixels that lie far below all others, or those around them",
+    "low_ratio": "mean of the low ones, relative to what they are compared with",
+    "high_fraction": "share of pixels that lie far above all others, or those around them",
 }
 NONLINEARITY = "a nonlinearity of the sensor that no effect here has"  # words of verdicts and advice
 # what remains, in words, by what a statistic compares (`Statistic.among`)
@@ -87,8 +87,8 @@ class Step:
     Attributes:
         values: the fitted values by name, each a `Value`. The names are those of the parameters. Of a map they are
             statistics of its values over the pixels: `sigma` (relative spread of the bulk), `low_fraction` and
-            `high_fraction` (shares of pixels far below and far above those around them), `low_ratio` (mean of the low
-            ones, relative to the middle of all).
+            `high_fraction` (shares of pixels far below and far above all others, or those around them), `low_ratio`
+            (mean of the low ones, relative to what they are compared with).
         misfit: of the model with this step, on held-out captures: mean squared standardised residual, 1 for a right
             model.
         significance: of the improvement, in standard deviations.

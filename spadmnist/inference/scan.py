@@ -83,7 +83,7 @@ class Scan:
         self._periodic = PeriodicSignatures()
 
         self.untried: list[dict[str, Any]] = []  # candidates that cannot be simulated: which, where, why
-        # (name, effects of the steps) of those that are excluded: a later step may add what one of them needs
+        # (name, effects of the steps but maps) of those that are excluded: a later step may add what one of them needs
         self._out: set[tuple[str, frozenset[str]]] = set()
         for name in Effect.registry:
             plugged = plugins.is_from_file(Effect.registry.find(name)) and replicates.start.effect(name) is None
@@ -111,7 +111,7 @@ class Scan:
 
     @property
     def _added(self) -> frozenset[str]:
-        return frozenset(candidate.effect for candidate in self.accepted)
+        return frozenset(candidate.effect for candidate in self.accepted if not candidate.carrier)
 
     def candidates(self, sensor: Sensor) -> list[Candidate]:
         """The candidates of a sensor without those that are excluded."""
@@ -132,7 +132,7 @@ class Scan:
             else:
                 self.not_tried(candidate.kind, candidate.effect, candidate.parameter, where, why(error))
             return
-        if wholly:  # what an earlier model could not do, this one can
+        if wholly and not self.is_excluded(candidate):  # what an earlier model could not do, this one can
             done = candidate.kind, candidate.effect, candidate.parameter, where
             self.untried = [e for e in self.untried if (e["change"], e["effect"], e["parameter"], e["where"]) != done]
 

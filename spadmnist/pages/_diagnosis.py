@@ -466,7 +466,7 @@ misfit on held-out data with it <b>{{ card.step.misfit | number }}</b></p>
 <details><summary>{{ card.odd.rows | length }} odd pixels\
 {% if card.odd.number > card.odd.rows | length %} of {{ card.odd.number }}{% endif %}</summary>
 <div class="wide"><table class="list">
-<thead><tr><th>pixel</th><th>value</th><th>relative to the pixels around it</th><th>kind</th></tr></thead>
+<thead><tr><th>pixel</th><th>value</th><th>relative to the others, or to those around it</th><th>kind</th></tr></thead>
 <tbody>
 {% for row in card.odd.rows %}
 <tr><td>{{ row.where }}</td><td class="figure">{{ row.value }}</td>\

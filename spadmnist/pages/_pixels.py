@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 _LISTED = 40  # odd pixels in the page; the file has all
 _FILE = "odd_pixels-{}.csv"  # the list of a map, by the name of its step
-_HEAD = ("row", "column", "value", "unit", "relative_to_median", "relative_to_surroundings", "kind")
+_HEAD = ("row", "column", "value", "unit", "relative_to_median", "relative_to_reference", "kind")
 _EARLIER = ",".join(_HEAD[:5])  # how lists begin, those of earlier versions included
 _HIGH, _LOW = "high", "low"
 
 
 @dataclass(frozen=True)
 class OddPixel:
-    """where: of the pixel; value: with its unit; ratio: to the pixels around it; kind: "high" or "low"."""
+    """where: of the pixel; value: with its unit; ratio: to what it is compared with; kind: "high" or "low"."""
 
     where: str
     value: str
@@ -71,10 +71,9 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
     unit = Effect.registry.find(carrier[0]).parameters[carrier[1]].unit if carrier[0] in Effect.registry else ""
     middle = float(np.median(values))
     ratios = values / middle if middle > 0 else np.full(values.size, np.nan)
-    around = fitted.around(values)
-    near = np.divide(values, around, out=np.full(values.size, np.nan), where=around > 0)
+    near = np.exp(fitted.estimate - fitted.odd[2])  # relative to all, or to the pixels around it
     odd = np.flatnonzero(low | high)
-    odd = odd[np.argsort(-np.abs(np.log(np.maximum(np.nan_to_num(near[odd], nan=1.0), 1e-9))), kind="stable")]
+    odd = odd[np.argsort(-np.abs(np.log(np.maximum(near[odd], 1e-9))), kind="stable")]
     table = [
         (
             int(k // shape[1]),
@@ -96,7 +95,8 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
     drawing = ratios.reshape(shape), _shown(middle, unit), odd
     picture = Picture(figures.drawn(_draw_map, *drawing), words)
     sentence = (
-        f"{int(high.sum())} of {values.size:,} pixels lie far above those around them and {int(low.sum())} far below; "
+        f"{int(high.sum())} of {values.size:,} pixels lie far above the others, or those around them, "
+        f"and {int(low.sum())} far below; "
         f"the median is {_shown(middle, unit)}."
     )
     file = _FILE.format(re.sub(r"[^a-z0-9_]+", "-", name.lower()))
