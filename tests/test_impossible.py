@@ -272,12 +272,8 @@ def test_what_cannot_be_fitted_as_a_step_is_tried_once(monkeypatch) -> None:
     monkeypatch.setattr(forward_step, "accept", fails)
     notes.tried = path.scan.scan(path.evaluation)
     best_added(path, notes, path.failed)
-    assert (
-        not path.steps
-        and "per_pixel detection.pdp" in taken
-        and len(set(taken)) == len(taken)
-        and not path.scan.accepted
-    )
+    assert "per_pixel detection.pdp" in taken and len(set(taken)) == len(taken)
+    assert not path.steps and not path.scan.accepted
     assert any(e["effect"] == "detection" and "no level" in e["why"] for e in path.scan.untried)
 
 
