@@ -75,8 +75,6 @@ def made(tmp_path):
 
 
 def measured(tmp_path, sensor, captures):
-    from dataclasses import replace
-
     from spadmnist.light import photons_from_irradiance
 
     recordings, plans = [], []
