@@ -96,8 +96,7 @@ def odd_pixels_of(found: Diagnosis, step: Step) -> OddPixels | None:
     picture = Picture(figures.drawn(_draw_map, *drawing), words)
     sentence = (
         f"{int(high.sum())} of {values.size:,} pixels lie far above the others, or those around them, "
-        f"and {int(low.sum())} far below; "
-        f"the median is {_shown(middle, unit)}."
+        f"and {int(low.sum())} far below; the median is {_shown(middle, unit)}."
     )
     file = _FILE.format(re.sub(r"[^a-z0-9_]+", "-", name.lower()))
     return OddPixels(file, picture, sentence, odd.size, rows, table, partial(figures.figure_by, _draw_map, *drawing))
