@@ -688,6 +688,23 @@ def test_no_warning_of_a_library_reaches_a_user(
         assert ("divide by zero" in capfd.readouterr().err) == says
 
 
+def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Where standard error is no terminal, what takes longer than 10 s says every 30 s how far it is."""
+    from spadmnist.cli import _terminal
+
+    now = 0.0
+    monkeypatch.setattr(_terminal.time, "monotonic", lambda: now)
+    with _terminal.progress() as progress:
+        progress.start("comparing", 100.0, 0.0)
+        for now in (4.0, 9.0, 12.0, 41.0, 43.0, 99.0, 100.0):
+            progress.advance(1.0 if now < 99 else 47.5, "lit")
+    assert capsys.readouterr().err.splitlines() == [
+        "comparing 3%, 12.0 s, 6.5 min left",
+        "comparing 5%, 43.0 s, 13.6 min left",
+        "comparing 52%, 99.0 s, 89.6 s left",
+    ]
+
+
 def test_time_left_is_not_shown_before_it_is_known() -> None:
     """A slow first part of the work (workers that start) is no estimate of the rest. The clock is given."""
     from spadmnist.cli._terminal import time_left

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
+import time
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -56,8 +58,36 @@ def time_left(done: float, rest: float, elapsed: float) -> str:
     return "estimating"
 
 
+_LOG_EVERY = (10.0, 30.0)  # s: a log has its first line after so long, the others so long after each other
+
+
+class _Log:
+    """In place of a bar, where standard error is no terminal: now and then a line with the time left."""
+
+    def __init__(self, what: str, total: float, done: float):
+        self.what, self.total, self.done, self.before = what, total, done, done
+        self.began = time.monotonic()
+        self.due = self.began + _LOG_EVERY[0]
+
+    def update(self, work: float) -> None:
+        self.done += work
+        now = time.monotonic()
+        if now < self.due or self.done >= self.total:
+            return
+        self.due = now + _LOG_EVERY[1]
+        elapsed = now - self.began
+        left = time_left(self.done - self.before, self.total - self.done, elapsed)
+        say(f"{self.what} {self.done / self.total:.0%}, {duration(elapsed)}, {left}")
+
+    def set_postfix_str(self, note: str, refresh: bool) -> None:
+        """A line has room for the time alone."""
+
+    def close(self) -> None:
+        """Nothing is left on the screen."""
+
+
 class progress:
-    """A progress bar on standard error, where that is a terminal."""
+    """A progress bar on standard error where that is a terminal, otherwise a line now and then."""
 
     def __enter__(self) -> Progress:
         from tqdm import tqdm
@@ -74,14 +104,17 @@ class progress:
                 return {**known, "left": time_left(done, rest, known["elapsed"])}
 
         bar: list[Any] = []
+        terminal = sys.stderr is not None and sys.stderr.isatty()
 
         def start(what: str, total: float, done: float) -> None:
+            if not terminal:
+                bar.append(_Log(what, total, done))
+                return
             bar.append(
                 Bar(
                     total=total,
                     initial=done,
                     desc=visible(what),
-                    disable=None,
                     leave=False,
                     bar_format="{desc} {percentage:3.0f}%|{bar}| {elapsed}, {left}{postfix}",
                 )
