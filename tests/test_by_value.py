@@ -29,7 +29,8 @@ import numpy as np
 
 import spadmnist as sp
 from spadmnist.inference.models import Model
-from spadmnist.inference.replicates import CaptureReplicates, Execution, Replicates
+from spadmnist.inference.capture_replicates import CaptureReplicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.statistics import Statistic, Summary
 from spadmnist.workers import executor
 

@@ -24,8 +24,8 @@ from test_factory import alive, descendants, wait_for, workers, write_config
 from spadmnist import disk
 from spadmnist.cli import _limits, _run
 from spadmnist.errors import SpadError
+from spadmnist.inference.capture_replicates import CaptureReplicates
 from spadmnist.inference.replicate_cache import keep, recall
-from spadmnist.inference.replicates import CaptureReplicates
 
 START = [sys.executable, "-c", "from spadmnist.start import main; main()"]
 SENTENCE = "Interrupted. What is complete is kept: the same command goes on from there."

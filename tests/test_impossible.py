@@ -26,13 +26,14 @@ from spadmnist.inference import (
     upper_limits,
 )
 from spadmnist.inference.candidates import candidates
+from spadmnist.inference.capture_replicates import CannotSimulate
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.forward_step import best_added, or_as_before
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import begin, rests_on
 from spadmnist.inference.model_selection import diagnose
-from spadmnist.inference.replicates import CannotSimulate, Replicates
+from spadmnist.inference.replicates import Replicates
 from spadmnist.inference.results import Step, Value, canonical, table
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.setups import rivals

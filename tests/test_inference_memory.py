@@ -15,10 +15,11 @@ from spadmnist import twin
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
 from spadmnist.inference import exact_likelihood, memory, point_process
+from spadmnist.inference.capture_replicates import CannotSimulate
 from spadmnist.inference.comparison import compare
 from spadmnist.inference.exact_likelihood import NoLikelihood, maximise
 from spadmnist.inference.point_process import Stamps
-from spadmnist.inference.replicates import CannotSimulate, Execution, Replicates
+from spadmnist.inference.replicates import Execution, Replicates
 from spadmnist.recording import Capture, Light
 from spadmnist.sensor import Sensor
 from spadmnist.workers import Loky, Serial, executor

@@ -10,6 +10,7 @@ import pytest
 from labs import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, labs, names, quiet, taken
 
 from spadmnist.inference.candidates import candidates
+from spadmnist.inference.capture_replicates import CannotSimulate
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import is_edge
 from spadmnist.inference.earlier_trials import has_changed
@@ -22,7 +23,7 @@ from spadmnist.inference.map_fits import bounds_of
 from spadmnist.inference.map_trials import map_trials_of
 from spadmnist.inference.model_path import ModelPath, accept, begin, keys_of, rests_on
 from spadmnist.inference.model_selection import another_step
-from spadmnist.inference.replicates import TOTALS, CannotSimulate
+from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.scan import Scan
 from spadmnist.inference.signature import signatures, size_of
 from spadmnist.inference.trial import Trial

@@ -13,6 +13,7 @@ from labs import CROSSTALK, DURATION, bench_of, change_of, quiet, taken
 
 from spadmnist.inference.alternatives import alternatives
 from spadmnist.inference.candidates import candidates
+from spadmnist.inference.capture_replicates import CannotSimulate
 from spadmnist.inference.conclusion import Notes
 from spadmnist.inference.coordinates import point_of
 from spadmnist.inference.elimination import left_in_own_cells
@@ -27,7 +28,7 @@ from spadmnist.inference.joint_fit import bounded
 from spadmnist.inference.model_path import ModelPath, begin
 from spadmnist.inference.model_selection import another_step, or_confused
 from spadmnist.inference.pixel_maps import PixelMap
-from spadmnist.inference.replicates import TOTALS, CannotSimulate
+from spadmnist.inference.replicates import TOTALS
 from spadmnist.inference.results import Step, mimic
 from spadmnist.inference.score_test import ScoreTest, explains_its_signature
 from spadmnist.inference.signature import Sampling, Signature, fall_of, residuals_at, signatures

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..errors import SpadError
+from .capture_replicates import CannotSimulate
 from .evaluation import (
     Evaluation,
     as_compared,
@@ -24,7 +25,7 @@ from .joint_fit import LOST, RISEN, SAME, WORTH, fit_all, informing, rise_of, wi
 from .levels import CLEARLY, LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
 from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
-from .replicates import TOTALS, CannotSimulate, Cell
+from .replicates import TOTALS, Cell
 from .results import Step, title
 from .signature import residuals_at, signatures
 from .trial_fits import fit_trial

@@ -17,6 +17,7 @@ from ..errors import UNABLE, SpadError, why
 from ..statistics import Summary
 from . import replicate_cache
 from .candidates import with_values
+from .capture_replicates import CannotSimulate, CaptureReplicates, joined
 from .captures_together import Together, checks_together
 from .closed_forms import most_detections
 from .coordinates import Key, Values
@@ -25,7 +26,7 @@ from .light_levels import CaptureNull, central_level, law_of, levels_about, matc
 from .mean_alone import of_mean
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
-from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, T, joined, no_size
+from .replicates import FEW, TOTALS, Cell, Replicates, T, no_size
 
 # turns: the golden ratio, by which each next light level of the replicates falls into the widest gap, for any number
 _GOLDEN = (math.sqrt(5) - 1) / 2
@@ -237,6 +238,8 @@ def _evaluate(
             if not null.law.exact:
                 evaluation.residuals[cell] = judged.residuals
                 evaluation.replicate_residuals[cell] = replicate_residuals(null, made, made.values[name])
+    if any(id in entries for id in results):
+        replicate_cache.make_room()
     _compare_totals(replicates, evaluation, n)
     return evaluation
 

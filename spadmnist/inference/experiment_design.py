@@ -15,12 +15,13 @@ from ..effects import Conditions, Mimic
 from ..foreign import visible
 from ..recording import Capture, Light, Recording
 from .candidates import Candidate
+from .capture_replicates import CannotSimulate
 from .closed_forms import closed_form
 from .evaluation import Evaluation, evaluate, square
 from .light_levels import level_error
 from .models import InTheDark, Model
 from .reduction import ReducedCapture
-from .replicates import CannotSimulate, Replicates, simulated
+from .replicates import Replicates, simulated
 from .results import NONLINEARITY, Step, plain
 from .scan import Scan
 from .setups import SetupExplanation

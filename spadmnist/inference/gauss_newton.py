@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from .capture_replicates import CannotSimulate
 from .coordinates import Coordinate, Key, point_of
 from .evaluation import Evaluation, stacked
 from .levels import FALL_95, HALF_95
 from .models import Model
-from .replicates import FEW, CannotSimulate, Cell, Replicates
+from .replicates import FEW, Cell, Replicates
 from .signature import Sampling, residuals_at, signatures
 
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.

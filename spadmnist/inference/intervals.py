@@ -8,13 +8,14 @@ from dataclasses import replace
 from ..errors import UNABLE
 from ..measurement import Measurement
 from .candidates import with_values
+from .capture_replicates import CannotSimulate
 from .coordinates import Coordinate, Key
 from .evaluation import evaluate, square
 from .exact_likelihood import NoLikelihood, maximise, not_in_likelihood, recordings
 from .gauss_newton import error_scale
 from .joint_fit import fit_all, model_of
 from .model_path import ModelPath, keys_of
-from .replicates import FEW, CannotSimulate
+from .replicates import FEW
 from .results import Value
 from .signature import IGNORED, Sampling, captures_showing, residuals_at, signatures
 from .trial_fits import EXCLUDED

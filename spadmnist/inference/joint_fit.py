@@ -13,13 +13,14 @@ import numpy as np
 from ..effects import Effect
 from ..errors import SpadError
 from . import count_model, map_models, pixel_maps
+from .capture_replicates import CannotSimulate
 from .coordinates import Coordinate, Key, is_edge, point_of
 from .evaluation import Evaluation, evaluate, square, stacked
 from .gauss_newton import Fit, JacobianBy, column_of, gauss_newton_step
 from .levels import HALF_95
 from .models import Model
 from .pixel_maps import map_values
-from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .results import Step, Value
 from .signature import IGNORED, Sampling, captures_showing, residuals_at, signatures
 

@@ -19,8 +19,8 @@ import numpy as np
 from .. import disk
 from ..sensor import Sensor
 from . import replicate_cache
+from .capture_replicates import CaptureReplicates
 from .reduction import ReducedCapture
-from .replicates import CaptureReplicates
 
 FOLDER = ".replicates"  # in the folder of a diagnosis, while it is not finished
 # bytes of all entries, beyond which nothing is added, so that a search that goes on simulates more again: the quick

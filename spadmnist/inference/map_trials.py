@@ -14,6 +14,7 @@ from ..errors import UNABLE
 from ..sensor import Sensor
 from . import count_model, map_models, pixel_maps
 from .candidates import Candidate, with_values
+from .capture_replicates import CannotSimulate
 from .coordinates import Key
 from .evaluation import Evaluation, square, stacked
 from .evidence import evidence_of
@@ -21,7 +22,7 @@ from .hit_pixels import drawn_effects
 from .levels import LEAST_EVIDENCE
 from .mixed_model import NO_PATTERN, PatternEvidence, evidence_of_scene
 from .models import Model
-from .replicates import CannotSimulate, Replicates
+from .replicates import Replicates
 from .score_test import PIXELS, p_of_map, sigmas_of
 from .signature import Signature, residuals_at, signatures, template_of
 from .trial import Trial, is_pattern, of_scene, tie

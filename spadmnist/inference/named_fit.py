@@ -19,6 +19,7 @@ from ..sensor import Sensor
 from ..workers import Executor, executor
 from . import count_model, counts_in_the_dark, time_blocks
 from .candidates import Candidate, candidates
+from .capture_replicates import CannotSimulate
 from .comparison import comparison_with
 from .coordinates import Coordinate, Key, point_of
 from .evidence import evidence_of
@@ -29,7 +30,7 @@ from .intervals import fit_where_hit, scale_errors
 from .joint_fit import complete_fit, completed, edge_errors, fit_all, variances_by_pixels
 from .levels import FALL_95, HALF_95, LEAST_P
 from .model_path import ModelPath, accept, begin, material
-from .replicates import FEW, REPLICATES, CannotSimulate, Execution, Replicates
+from .replicates import FEW, REPLICATES, Execution, Replicates
 from .results import Diagnosis, Step, Value, title
 from .score_test import p_of_map
 from .signature import Signature, signature_of_totals, template_of

@@ -20,7 +20,7 @@ from .contrasts import Contrasts
 from .laws import Law, law_of
 
 if TYPE_CHECKING:
-    from .replicates import CaptureReplicates
+    from .capture_replicates import CaptureReplicates
 
 # of the range of the replicates' totals: how far beyond it they inform expectations. Farther off, where wrong models
 # had been called right, the expectation is that of the end; a rule of thumb

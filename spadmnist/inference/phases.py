@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from .candidates import Candidate
+from .capture_replicates import CannotSimulate
 from .coordinates import Key
 from .evaluation import Evaluation, evaluate
 from .light_levels import totals_space
 from .models import phase_parameters
-from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Sampling, Signature, residuals_at, residuals_shifted, signatures
 from .spectral_lines import Line
 

@@ -16,11 +16,12 @@ from typing import Any
 
 from ..errors import SpadError
 from .budget import OutOfBudget
+from .capture_replicates import CannotSimulate
 from .coordinates import Key, Values, point_of
 from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square
 from .gauss_newton import Fit, JacobianBy, gauss_newton_step
 from .models import Model
-from .replicates import FEW, CannotSimulate, Replicates
+from .replicates import FEW, Replicates
 from .signature import IGNORED, Sampling, captures_showing, residuals_at, signatures, template_of
 from .trial import Trial
 

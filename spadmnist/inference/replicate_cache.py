@@ -1,4 +1,6 @@
-"""The cache of replicates on disk: another measurement of the same model then costs one reduction.
+"""The cache of replicates on disk: of a model as it is stated, and of its candidates where they are tried first.
+
+Another measurement of the same plan then costs one reduction, and what its own search asks for.
 
 The name of an entry is a digest of everything that it is a function of: sensor, capture, light, seed, the program's
 own sources and the user's plug-ins. An entry ends with the digest of its content. An entry that cannot be read, or is
@@ -25,8 +27,8 @@ from ..foreign import from_json
 from ..images import cache_folder
 from ..recording import Capture
 from ..sensor import Sensor
+from .capture_replicates import CaptureReplicates
 from .reduction import own_statistics
-from .replicates import CaptureReplicates
 
 SUFFIX = ".replicates"  # of the name of an entry's file
 # bytes of all entries together: the oldest of more are removed, and simulated anew; a rule of thumb
@@ -82,14 +84,13 @@ def recall(name: str | None) -> CaptureReplicates | None:
 
 
 def keep(name: str | None, made: CaptureReplicates) -> None:
-    """Write an entry. An error of the disk is ignored: the cache is no part of the result."""
+    """Write an entry; `make_room` is for the caller. An error of the disk is ignored: no result depends on it."""
     if name is None:
         return
     folder = nulls_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         disk.put_file(folder / f"{name}{SUFFIX}", packed(made))
-        _make_room(folder)
     except (OSError, SpadError):  # what is not in the cache is simulated again
         return
 
@@ -147,16 +148,18 @@ def _intact(data: bytes) -> tuple[bytes, memoryview]:
     return data[:end], whole[end + 1 :]
 
 
-def _make_room(folder: Path) -> None:
+def make_room() -> None:
+    """Remove the oldest entries beyond the most that are kept."""
     facts = {}
-    for path in folder.glob("[!.]*"):  # those of earlier programs, too, and none that is being written
+    for path in nulls_folder().glob("[!.]*"):  # those of earlier programs, too, and none that is being written
         with contextlib.suppress(FileNotFoundError):
             facts[path] = path.stat()
     total = 0
     for path in sorted(facts, key=lambda path: facts[path].st_mtime, reverse=True):
         total += facts[path].st_size
         if total > _MOST_BYTES:
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 def nulls_folder() -> Path:

@@ -9,26 +9,25 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from .. import twin
-from ..errors import UNABLE, SpadError, why
+from ..errors import UNABLE
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
 from ..statistics import Summary
 from ..streams import Streams
 from ..workers import Executor
-from . import memory
+from . import memory, replicate_cache
 from .budget import Budget, work_of
 from .candidates import Candidate, candidates, maps_added
+from .capture_replicates import CannotSimulate, CaptureReplicates, joined
+from .journal import Journal
 from .models import InTheDark, Model, Packed
 from .reduction import ReducedCapture, check_cells, halves_of, statistics_for, summaries_of, total_of
-
-if TYPE_CHECKING:
-    from .journal import Journal
 
 T = TypeVar("T")
 Cell = tuple[str, str]  # (capture, statistic)
@@ -46,45 +45,6 @@ _FEW_EVENTS = 100_000
 _SIMULATING = 0.4
 # replicates whose scales are averaged, however many there are, so that more of them change no scale; a rule of thumb
 _SCALES = 8
-
-
-class CannotSimulate(SpadError):
-    """A model cannot be simulated. The message is the reason.
-
-    In a list of results it takes the place of the result of its model.
-    """
-
-    @classmethod
-    def because(cls, error: BaseException) -> CannotSimulate:
-        """The error that says why a model cannot be simulated, of any error that was raised.
-
-        It has no traceback, which would hold all that was simulated with it.
-        """
-        return cls(str(error) if isinstance(error, cls) else why(error))
-
-
-@dataclass
-class CaptureReplicates:
-    """The replicates of one capture under a model.
-
-    Attributes:
-        numbers: (replicates,) the numbers that seed each of them.
-        totals: (replicates,) detections of the whole array that inform the light level (`ReducedCapture.total`).
-        values: (replicates, cells) by statistic.
-        laws: (law, scale of the cells) by statistic, as in `Summary`.
-    """
-
-    numbers: np.ndarray
-    totals: np.ndarray
-    values: dict[str, np.ndarray]
-    laws: dict[str, tuple[str, np.ndarray | None]]
-
-    def first(self, number: int) -> CaptureReplicates:
-        """The first `number` replicates, or all of them where there are fewer."""
-        values = {name: x[:number] for name, x in self.values.items()}
-        return CaptureReplicates(
-            numbers=self.numbers[:number], totals=self.totals[:number], values=values, laws=self.laws
-        )
 
 
 @dataclass(frozen=True)
@@ -312,6 +272,7 @@ class Replicates:
         pieces: int = 1,
         hasty: bool = False,
         names: Sequence[Collection[str]] | None = None,
+        remember: Sequence[bool] | None = None,
     ) -> list[CaptureReplicates | CannotSimulate]:
         """The replicates of each (model, capture, photons, numbers), in their order.
 
@@ -320,12 +281,13 @@ class Replicates:
             pieces: number of tasks for each capture.
             hasty: without costly statistics.
             names: of each, the statistics that are reduced; all where it is empty.
+            remember: of each, whether the cache on disk is read and written: another measurement will ask for it.
         Raises:
             OutOfBudget: where the budget does not allow them.
         """
         tasks: list[list[_Task]] = []
         out: list[CaptureReplicates | CannotSimulate] = [CannotSimulate()] * len(wanted)
-        some_of = names or [()] * len(wanted)
+        some_of, cached = names or [()] * len(wanted), remember or [False] * len(wanted)
         entries: list[str | None] = [None] * len(wanted)
         most, work = 0.0, [0.0] * len(wanted)  # bytes of a replicate; s of two idle cores
         for k, (model, id, photons, numbers) in enumerate(wanted):
@@ -335,9 +297,9 @@ class Replicates:
             cells = {name: summary.values.size for name, summary in self.seen[id].summaries.items()}
             try:
                 sensors = [model.of(id, int(number)) for number in ([0] if model.alike else numbers)]
-                if self.journal is not None:
+                if self.journal is not None or cached[k]:
                     more = self.seed, self.dead, pieces, hasty, *sorted(some_of[k])
-                    entries[k] = self.journal.name(sensors, self.seen[id], photons, numbers, *more)
+                    entries[k] = Journal.name(sensors, self.seen[id], photons, numbers, *more)
                 if len(numbers):
                     most = max(most, self._bytes(sensors[0], id, photons))
                     work[k] = len(numbers) * self.work_of(sensors[0], id) * _share_of_work(capture, some_of[k])
@@ -364,7 +326,10 @@ class Replicates:
         self.budget.spend(sum(work))
         self.simulations += sum(len(numbers) for some, (_, _, _, numbers) in zip(tasks, wanted, strict=True) if some)
         for k, some in enumerate(tasks):
-            if some and self.journal and (before := self.journal.recall(entries[k])) is not None:
+            before = self.journal.recall(entries[k]) if some and self.journal else None
+            if some and before is None and cached[k]:
+                before = replicate_cache.recall(entries[k])
+            if before is not None:
                 tasks[k], out[k] = [], before
                 self.budget.remembered += work[k]
         owners = [k for k, some in enumerate(tasks) for _ in some]
@@ -383,8 +348,12 @@ class Replicates:
                 out[k] = whole = _whole([part for _, part in sorted(simulated.pop(k).items())])
                 if self.journal and isinstance(whole, CaptureReplicates):
                     self.journal.keep(entries[k], whole)
+                if cached[k] and isinstance(whole, CaptureReplicates):
+                    replicate_cache.keep(entries[k], whole)
 
         self._limited(most).run(_simulate, lambda keys: (every[given[key]] for key in keys), list(given), done)
+        if any(cached[k] for k in owners):
+            replicate_cache.make_room()
         return out
 
 
@@ -399,17 +368,6 @@ def _whole(parts: Sequence[CaptureReplicates | CannotSimulate]) -> CaptureReplic
     """The parts of one capture together; the error of one of them where there is one."""
     wrong = [part for part in parts if isinstance(part, CannotSimulate)]
     return wrong[0] if wrong else joined([part for part in parts if isinstance(part, CaptureReplicates)])
-
-
-def joined(parts: Sequence[CaptureReplicates]) -> CaptureReplicates:
-    """Replicates of one capture together: of the statistics that all of them have."""
-    names = [name for name in parts[0].values if all(name in part.values for part in parts)]
-    return CaptureReplicates(
-        numbers=np.concatenate([p.numbers for p in parts]),
-        totals=np.concatenate([p.totals for p in parts]),
-        values={name: np.concatenate([p.values[name] for p in parts]) for name in names},
-        laws={name: parts[0].laws[name] for name in names},
-    )
 
 
 def simulated(

@@ -14,6 +14,7 @@ from ..effects import Effect
 from ..errors import UNABLE, SpadError, why
 from ..sensor import Sensor
 from .candidates import Candidate, has_random_pixels, templates, with_values
+from .capture_replicates import CannotSimulate
 from .coordinates import Key, is_edge
 from .earlier_trials import completed, still_valid
 from .evaluation import Evaluation, block_checks, failing, square
@@ -21,7 +22,7 @@ from .levels import COST_OF_A_PARAMETER, LEAST_P, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
 from .models import Model
 from .phases import NEAR, TIMES, PeriodicSignatures
-from .replicates import FEW, CannotSimulate, Replicates
+from .replicates import FEW, Replicates
 from .score_test import best_direction, sigmas_of
 from .signature import (
     Sampling,
@@ -230,7 +231,7 @@ class Scan:
                         chips=chips,
                     )
                 )
-        for one in self.simulated(evaluation, still, few, only):
+        for one in self.simulated(evaluation, still, few, only, remember=True):
             one.seen = set(only or evaluation.made)
             one.size = size_of(self.replicates, evaluation, one.signature)
             one.fall, one.times = self.line_search(evaluation, one.signature, one.signed)
@@ -274,7 +275,12 @@ class Scan:
         return next((line for line in self.lines(evaluation) if line.frequency in at), None)
 
     def simulated(
-        self, evaluation: Evaluation, tried: Sequence[Trial], few: int = _SCAN, only: Sequence[str] = ()
+        self,
+        evaluation: Evaluation,
+        tried: Sequence[Trial],
+        few: int = _SCAN,
+        only: Sequence[str] = (),
+        remember: bool = False,
     ) -> list[Trial]:
         """The trials with their signatures; those that cannot be simulated are left out and recorded.
 
@@ -286,9 +292,8 @@ class Scan:
                 if opposite := _opposite(evaluation, one):
                     down[i] = opposite
         models = [one.sensors for one in tried if one.sensors is not None]
-        made = signatures(
-            self.replicates, evaluation, [*models, *down.values()], Sampling(few=few, only=only, kept="sure")
-        )
+        sampling = Sampling(few=few, only=only, remember=remember, kept="sure")
+        made = signatures(self.replicates, evaluation, [*models, *down.values()], sampling)
         downs = dict(zip(down, made[len(tried) :], strict=True))
         out = []
         for i, (one, up) in enumerate(zip(tried, made, strict=False)):

@@ -17,10 +17,11 @@ from scipy import stats
 from ..errors import SpadError
 from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate
+from .capture_replicates import CannotSimulate
 from .coordinates import Key
 from .evaluation import Evaluation, stacked
 from .levels import LEAST_P
-from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Sampling, Signature, signatures, template_of
 from .spectral_lines import Line
 from .statistic_maps import p_of_width

@@ -20,12 +20,13 @@ from scipy import stats
 from .. import twin
 from ..errors import UNABLE
 from .candidates import templates
+from .capture_replicates import CannotSimulate
 from .closed_forms import closed_form, level_for
 from .evaluation import Evaluation, square, with_totals_anew
 from .levels import COST_OF_A_PARAMETER, FALSE_ALARM, HALF_95
 from .light_levels import totals_space
 from .models import InTheDark
-from .replicates import TOTALS, CannotSimulate, Replicates, simulated
+from .replicates import TOTALS, Replicates, simulated
 from .results import plain
 from .scan import Scan
 from .signature import Signature, residuals_at, signature_of_totals, signatures

@@ -15,11 +15,12 @@ import numpy as np
 from scipy import ndimage, stats
 
 from ..errors import UNABLE, SpadError, why
+from .capture_replicates import CannotSimulate, CaptureReplicates, joined
 from .evaluation import Evaluation, far_wider, square
 from .light_levels import matched_light, needed_light, totals_space
 from .models import Model
 from .null_distribution import residuals_of
-from .replicates import FEW, TOTALS, CannotSimulate, CaptureReplicates, Cell, Replicates, joined
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .shifts import beyond_noise, mean_shift
 
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
@@ -162,6 +163,7 @@ class Sampling:
         only: the captures that are simulated; all where it is empty.
         names: the statistics that are reduced; all where it is empty.
         hasty: without costly statistics.
+        remember: what is simulated of the model as it is stated is kept for other measurements of the plan.
         kept: which shifts are kept. "sure": those that are hardly ever noise (a signature). "likely": those that are
             hardly all noise (a derivative, which would otherwise be too small). "all": all.
     """
@@ -170,6 +172,7 @@ class Sampling:
     only: Collection[str] = ()
     names: Collection[str] = ()
     hasty: bool = True
+    remember: bool = False
     kept: Kept = "likely"
 
 
@@ -192,6 +195,7 @@ def signatures(
         [id for id in evaluation.made if not some or id in some] for some in only_of or [sampling.only] * len(models)
     ]
     wanted, unable = [], dict[int, CannotSimulate]()
+    stated: list[bool] = []
     for k, (sensors, ids) in enumerate(zip(models, ids_of, strict=True)):
         own = []
         try:
@@ -201,8 +205,10 @@ def signatures(
         except UNABLE as error:
             unable[k], own = CannotSimulate.because(error), []
         wanted += own
+        stated += [not evaluation.values and (at := evaluation.rates[id]).level == at.stated for _, id, _, _ in own]
     names = [sampling.names] * len(wanted)
-    simulated = replicates.simulate(wanted, hasty=sampling.hasty, names=names)
+    remember = stated if sampling.remember else None
+    simulated = replicates.simulate(wanted, hasty=sampling.hasty, names=names, remember=remember)
     if sampling.kept == "sure":  # a derivative is a difference of the same few replicates and needs no more
         simulated = _more_replicates(replicates, evaluation, wanted, simulated, sampling)
     results = iter(simulated)

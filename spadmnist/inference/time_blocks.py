@@ -14,11 +14,12 @@ import numpy as np
 
 from ..statistics import Summary
 from . import count_model, held_out, map_models
+from .capture_replicates import CannotSimulate
 from .error_budget import Rung
 from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95
 from .laws import law_of
 from .reduction import halves_of
-from .replicates import CannotSimulate, Cell, Replicates
+from .replicates import Cell, Replicates
 from .signature import residuals_at, signatures
 
 # relative, on the axis: cells of two captures at the same place, whose Jacobian is the same but for the detections; a

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from .capture_replicates import CannotSimulate
 from .coordinates import Coordinate, Key, is_edge, point_of, room_of
 from .evaluation import Evaluation, block_checks, failing, square, stacked
 from .gauss_newton import Effort, Fit, covariance_of, gauss_newton
 from .phases import NEAR, choose_phase, simulate_phases
 from .random_pixels import fit_by_own_scatter
-from .replicates import FEW, TOTALS, CannotSimulate, Cell, Replicates
+from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import (
     IGNORED,
     Sampling,

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from .capture_replicates import CannotSimulate
 from .evaluation import Evaluation, stacked
 from .gauss_newton import Fit, column_of
-from .replicates import FEW, CannotSimulate, Cell, Replicates
+from .replicates import FEW, Cell, Replicates
 from .results import plain
 from .scan import Scan
 from .score_test import ScoreTest, score_test

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from .capture_replicates import CannotSimulate
 from .coordinates import Coordinate, Key
 from .evaluation import square
 from .gauss_newton import Effort, Fit, gauss_newton
 from .joint_fit import WORTH, fit_all
-from .replicates import CannotSimulate
 from .results import Step
 from .signature import IGNORED, captures_showing
 from .trial_fits import fit_whole_number
