@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import laws
 import numpy as np
 import pytest
-from labs import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, quiet, taken, wrong_numbers
+from labs import CROSSTALK, LIFETIME, PROBABILITY, bench_of, change_of, given, labs, quiet, taken, wrong_numbers
 from scipy import stats
 
 import spadmnist as sp
@@ -697,3 +698,28 @@ def test_an_edge_that_is_thought_to_be_far_off_is_tried_where_it_was_seen_too(la
     # near by it goes where it is led
     (found,) = path.scan.again(path.evaluation, {}, [replace(seen, fall=1000.0, times=1.2)])
     assert found.values[key] == pytest.approx(6e-9)
+
+
+# --- another measurement of the plan -----------------------------------------------------------------------------
+
+
+def test_another_measurement_of_the_plan_finds_what_the_first_one_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What candidates of the stated model are tried first does not depend on the data. A cache changes no answer."""
+    lab = labs(tmp_path)
+
+    def looked(seed: int, cache: str) -> tuple[list[tuple[str, float]], float, float]:
+        monkeypatch.setenv("SPADMNIST_CACHE", str(tmp_path / cache))
+        replicates = bench_of(lab("    afterpulsing: {probability: 1 %, lifetime: 30 ns}\n", seed=seed), 16)
+        path = begin(replicates)
+        before = replicates.budget.spent, replicates.budget.remembered
+        found = [(one.candidate.name, one.fall) for one in path.scan.scan(path.evaluation)]
+        return found, replicates.budget.spent - before[0], replicates.budget.remembered - before[1]
+
+    _, work, remembered = looked(1, "kept")
+    assert work > 0 and remembered == 0
+    found, work, remembered = looked(2, "kept")
+    assert remembered > 0.8 * work
+    assert looked(2, "anew") == (found, work, 0.0)
+    assert not list((tmp_path / "kept").rglob("*.part"))

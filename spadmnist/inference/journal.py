@@ -7,8 +7,8 @@ counts as if they had been simulated, because the budget decides what is tried.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -72,15 +72,12 @@ class Journal:
         """Add replicates. An error of the disk is ignored: they are simulated again."""
         if name is None or self.bytes > _MOST_BYTES:
             return
-        data, part = replicate_cache.packed(made), self.folder / f"{name}.part"
-        try:
+        data = replicate_cache.packed(made)
+        with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
             if len(data) <= _LARGEST and self._own():
-                part.write_bytes(data)
-                os.replace(part, self._path(name))
+                replicate_cache.write_entry(self.folder, name, data)
                 self.bytes += len(data)
-        except OSError:
-            part.unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Remove the journal: the search is finished."""

@@ -20,9 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import disk, plugins
+from .. import plugins
 from ..compiled import digest_of_sources
-from ..errors import SpadError
 from ..foreign import from_json
 from ..images import cache_folder
 from ..recording import Capture
@@ -31,8 +30,9 @@ from .capture_replicates import CaptureReplicates
 from .reduction import own_statistics
 
 SUFFIX = ".replicates"  # of the name of an entry's file
-# bytes of all entries together: the oldest of more are removed, and simulated anew; a rule of thumb
-_MOST_BYTES = 1 << 30
+# bytes of all entries together, and their number: the oldest of more are removed, and simulated anew. Some 200 entries
+# of 120 MB are those of four captures with 1.5 million time stamps. Rules of thumb
+_MOST_BYTES, _MOST_ENTRIES = 1 << 30, 4096
 
 
 def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:
@@ -87,12 +87,25 @@ def keep(name: str | None, made: CaptureReplicates) -> None:
     """Write an entry; `make_room` is for the caller. An error of the disk is ignored: no result depends on it."""
     if name is None:
         return
-    folder = nulls_folder()
+    with contextlib.suppress(OSError):  # what is not in the cache is simulated again
+        nulls_folder().mkdir(parents=True, exist_ok=True)
+        write_entry(nulls_folder(), name, packed(made))
+
+
+def write_entry(folder: Path, name: str, data: bytes) -> None:
+    """Write an entry, there as a whole or not at all; its digest tells what a power cut left of it.
+
+    Raises:
+        OSError: where it cannot be written.
+    """
+    part = folder / f"{name}.{os.getpid()}.part"  # of another process that writes the same entry it is another file
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        disk.put_file(folder / f"{name}{SUFFIX}", packed(made))
-    except (OSError, SpadError):  # what is not in the cache is simulated again
-        return
+        part.write_bytes(data)
+        os.replace(part, folder / f"{name}{SUFFIX}")
+    except OSError:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
 
 
 def packed(made: CaptureReplicates) -> bytes:
@@ -155,9 +168,9 @@ def make_room() -> None:
         with contextlib.suppress(FileNotFoundError):
             facts[path] = path.stat()
     total = 0
-    for path in sorted(facts, key=lambda path: facts[path].st_mtime, reverse=True):
+    for number, path in enumerate(sorted(facts, key=lambda path: facts[path].st_mtime, reverse=True)):
         total += facts[path].st_size
-        if total > _MOST_BYTES:
+        if total > _MOST_BYTES or number >= _MOST_ENTRIES:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
 
