@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,12 @@ from spadmnist.inference.signature import Signature, signature_of_totals, signat
 from spadmnist.sensor import Sensor
 
 _AFTER = "afterpulsing: {probability: 0.05, lifetime: 30 ns}\n"
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is broken here is simulated, whatever others have."""
+    monkeypatch.setenv("SPADMNIST_CACHE", str(tmp_path / "cache"))
 
 
 class Broken:
@@ -276,6 +283,20 @@ def test_what_cannot_be_fitted_as_a_step_is_tried_once(monkeypatch) -> None:
     assert "per_pixel detection.pdp" in taken and len(set(taken)) == len(taken)
     assert not path.steps and not path.scan.accepted
     assert any(e["effect"] == "detection" and "no level" in e["why"] for e in path.scan.untried)
+
+
+def test_what_a_later_model_can_do_was_not_left_out(lab, monkeypatch) -> None:
+    """A candidate whose first look fails is looked at again under the next model, and stands in `not_tried` no more."""
+    path = begin(bench_of(lab(), 8))
+    broken = Broken(monkeypatch, "crosstalk", SpadError("a cascade does not end"), armed=True)
+    first = path.scan.scan(path.evaluation, everywhere=True)
+    assert {(e["effect"], e["where"]) for e in path.scan.untried} == {("crosstalk", "the first look")}
+    assert all(one.candidate.effect != "crosstalk" for one in first)
+    again = path.scan.scan(path.evaluation, everywhere=True, known=first)
+    assert len(path.scan.untried) == 1 and all(one.candidate.effect != "crosstalk" for one in again)
+    broken.armed = False
+    assert any(one.candidate.effect == "crosstalk" for one in path.scan.scan(path.evaluation, True, known=again))
+    assert not path.scan.untried
 
 
 def test_a_sensor_that_cannot_be_simulated_itself_is_one_error(lab, monkeypatch) -> None:

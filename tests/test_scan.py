@@ -516,7 +516,7 @@ def test_the_template_nearest_to_where_it_suits_is_looked_at_again(lab, monkeypa
         Trial(candidate, {CROSSTALK: x}, nothing, gain, t) for x, gain, t in ((0.1, 50.0, 0.03), (0.004, 45.0, 0.8))
     )
     seen: list[Trial] = []
-    monkeypatch.setattr(Scan, "simulated", lambda self, evaluation, tried, few, only=(): seen.extend(tried) or [])
+    monkeypatch.setattr(Scan, "simulated", lambda self, evaluation, tried, *_, **__: seen.extend(tried) or [])
     asked: list[float] = []
     monkeypatch.setattr(
         "spadmnist.inference.scan.map_trials_of", lambda scan, evaluation, values, least: asked.append(least) or []
@@ -558,7 +558,7 @@ def test_a_faint_template_of_another_shape_is_looked_at_beside_a_strong_one(lab,
         for p, t, gain, times in ((0.0085, 3e-7, 74.0, 1.7), (7e-4, 8e-11, 50.0, 7.2), (7e-4, 2e-8, 49.0, 1.5))
     )
     seen: list[Trial] = []
-    monkeypatch.setattr(Scan, "simulated", lambda self, evaluation, tried, few, only=(): seen.extend(tried) or [])
+    monkeypatch.setattr(Scan, "simulated", lambda self, evaluation, tried, *_, **__: seen.extend(tried) or [])
     monkeypatch.setattr("spadmnist.inference.scan.map_trials_of", lambda scan, evaluation, values, least: [])
     look.again(evaluation, {}, [strong, faint, near])
     assert [one.values[delay] for one in seen] == [3e-7, 8e-11]

@@ -43,7 +43,8 @@ def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:
     """
     own = {cls for cls in [*map(type, sensor.effects), *own_statistics()] if plugins.is_own(cls)}
     texts = [_text(plugins.source_file(cls)) for cls in sorted(own, key=lambda cls: cls.__module__)]
-    if any(cls.__module__ == "__main__" for cls in own) or None in texts:
+    # a notebook has no file; what a function makes depends on what it was called with
+    if any(cls.__module__ == "__main__" or "<locals>" in cls.__qualname__ for cls in own) or None in texts:
         return None
     digest = hashlib.sha256(digest_of_sources().encode())
     for _, text in sorted(plugins.loaded_files().items()):

@@ -84,6 +84,7 @@ class Scan:
         self._periodic = PeriodicSignatures()
 
         self.untried: list[dict[str, Any]] = []  # candidates that cannot be simulated: which, where, why
+        self._reported: set[str] = set()  # effects that were said to be among them
         # (name, effects of the steps but maps) of those that are excluded: a later step may add what one of them needs
         self._out: set[tuple[str, frozenset[str]]] = set()
         for name in Effect.registry:
@@ -95,7 +96,8 @@ class Scan:
     def not_tried(self, kind: str, effect: str, parameter: str | None, where: str, why: str) -> None:
         """Record that a candidate cannot be simulated, where, and why; it is reported once for each effect."""
         entry = {"change": kind, "effect": effect, "parameter": parameter, "where": where, "why": why}
-        if all(entry["effect"] != other["effect"] for other in self.untried):
+        if effect not in self._reported:
+            self._reported.add(effect)
             self.say(f"not tried: {effect} ({why})")
         which = ("change", "effect", "parameter", "where")
         if all(any(entry[k] != other[k] for k in which) for other in self.untried):
@@ -324,6 +326,8 @@ class Scan:
         if not everywhere and self.only_rates(evaluation):
             out = self.trials_by_totals(evaluation, tries)
         else:
+            # each is looked at again: what an earlier model could not simulate, this one may
+            self.untried = [entry for entry in self.untried if entry["where"] != _LOOKING]
             some = [] if everywhere else self.most_informative(evaluation)
             still = still_valid(self, evaluation, tries, [t for t in known if t.seen], everywhere)
             old = completed(self, evaluation, still, some or evaluation.made)
