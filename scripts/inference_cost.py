@@ -4,9 +4,10 @@
     python scripts/inference_cost.py frames       # four captures of 64 x 64 pixels x 4,000 frames
     python scripts/inference_cost.py stamps       # 1.5 million time stamps in four captures
 
-The first measurement finds nothing remembered of its plan. The second one is another measurement of the same plan, and
-finds what the first one left. Compiled code is at hand for both: a small measurement is diagnosed before. The peak is
-that of all processes together, shared pages counted once (PSS), as sampled. Linux only.
+The first measurement finds nothing remembered of its plan: each verb has a cache of its own. The second one is another
+measurement of the same plan, and finds what the first one left. Compiled code is at hand for both: a small measurement
+is diagnosed before. The peak is that of all processes together, shared pages counted once (PSS), as sampled. Only on
+Linux.
 """
 
 from __future__ import annotations
@@ -83,14 +84,15 @@ def measured(name: str, place: Path) -> None:
             with contextlib.redirect_stderr(io.StringIO()):
                 spadmnist.simulate(place / "truth.yaml", place / "plan.yaml", seed, folder=lab)
             for verb in ("compare", "diagnose"):
-                out = place / "answer.json"
+                out = place / f"{each}-{seed}-{verb}.json"
+                (place / verb).mkdir(exist_ok=True)
                 more = ["--quick", "-o", str(place / f"{each}-{seed}-found")] if verb == "diagnose" else []
                 began = time.monotonic()
-                most = peak([verb, str(model), str(lab), "--json", str(out), *more], place, 3600.0, (0, 1))
+                most = peak([verb, str(model), str(lab), "--json", str(out), *more], place / verb, 3600.0, (0, 1))
                 seconds = time.monotonic() - began
                 if each == "lab":
-                    answer = json.loads(out.read_text())
-                    print(f"| {name} | {seed} | {verb} | {seconds:.0f} | {most} | {answer['verdict']} |", flush=True)
+                    verdict = json.loads(out.read_text())["verdict"] if out.exists() else "-"
+                    print(f"| {name} | {seed} | {verb} | {seconds:.0f} | {most} | {verdict} |", flush=True)
 
 
 def main() -> None:

@@ -20,6 +20,7 @@ import pkgutil
 import re
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -612,6 +613,7 @@ def source_file(cls: type) -> str:
     return getattr(module, "__file__", None) or "<interactive>"
 
 
+IMPORTED = time.time()  # s since the epoch: before any class of the user's could be made
 _discovered = False
 _MODULE = "spadmnist_plugin_"  # how the modules of such files are named
 _loaded: dict[Path, str] = {}
@@ -706,7 +708,12 @@ def load_file(path: str | Path) -> None:
 
 def is_from_file(cls: type) -> bool:
     """Does a class come from a file that `load_file` has loaded?"""
-    return cls.__module__.startswith(_MODULE)
+    return is_module_of_file(cls.__module__)
+
+
+def is_module_of_file(name: str) -> bool:
+    """Is it the name of a module that `load_file` has made?"""
+    return name.startswith(_MODULE)
 
 
 def is_built_in(cls: type) -> bool:

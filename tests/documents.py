@@ -55,6 +55,7 @@ RULES = {
         "it takes most of an hour",
     ),
     "make bench": ("make -n -o .venv/installed bench", "it takes minutes of an idle machine"),
+    "python scripts/inference_cost.py": ("python scripts/inference_cost.py --help", "it takes a quarter of an hour"),
     "python scripts/memory.py": ("python scripts/memory.py --help", "it makes and reads gigabytes"),
     "make faults": ("make -n -o .venv/installed faults", "it takes up to an hour; test_faults.py runs the script"),
     "make challenge": (

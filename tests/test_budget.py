@@ -131,11 +131,17 @@ def test_the_time_left_is_that_of_the_speed_after_the_start(monkeypatch):
     one.spend(20.0)
     now[0] = 150.0
     assert one.left == 270.0 * 50 / 20
-    one.spend(70.0, remembered=70.0)  # what a cache held took no time
+    one.spend(70.0)
+    one.remember(70.0)  # what a cache held took no time
     assert one.left == 200.0 * 50 / 20
     now[0] = 1190.0
     assert one.left == 10.0  # the clock ends it
     assert Budget().left == math.inf
+    one = Budget(400.0, began=0.0)
+    one.spend(0.1 + 0.2)
+    one.remember(0.3)  # but for rounding, as much
+    one.spend(1.0)
+    assert one.measured_from is None
 
 
 def test_a_time_as_people_read_it():

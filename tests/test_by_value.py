@@ -161,10 +161,9 @@ def test_what_depends_on_code_of_no_file_has_no_name_in_the_cache() -> None:
         layout = sp.Layout(1, 2, 25e-12, 0.5)
         plain = sp.Sensor(layout, [sp.effects.DarkCounts(rate=3.0)], rules="device")
         own = plain.with_effect(cls())
-        assert replicate_cache.entry_name(plain, flat) and replicate_cache.entry_name(
-            own, flat
-        )  # of a file that is there
-        cls.__module__ = "__main__"
+        assert replicate_cache.entry_name(plain, flat)
+        assert replicate_cache.entry_name(own, flat) is None  # a function has made it
+        cls.__module__, cls.__qualname__ = "__main__", "Held"
         assert replicate_cache.entry_name(own, flat) is None
         assert replicate_cache.recall(None) is None
         assert replicate_cache.entry_name(plain, flat)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import io
 import json
 import os
 import shutil
@@ -13,6 +14,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -703,6 +705,19 @@ def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: 
         "comparing 5%, 43.0 s, 13.6 min left",
         "comparing 52%, 99.0 s, 89.6 s left",
     ]
+
+
+@pytest.mark.parametrize("stream", [None, SimpleNamespace(write=len, flush=lambda: None), "closed"])
+def test_what_stands_in_place_of_standard_error_is_no_terminal(stream: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from spadmnist.cli import _terminal
+
+    if stream == "closed":
+        stream = io.StringIO()
+        stream.close()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with _terminal.progress() as progress:
+        progress.start("comparing", 0.0, 0.0)
+        progress.advance(1.0, "lit")
 
 
 def test_time_left_is_not_shown_before_it_is_known() -> None:

@@ -86,6 +86,14 @@ class _Log:
         """Nothing is left on the screen."""
 
 
+def _is_terminal() -> bool:
+    """Whether standard error is one; what a program put in its place may not know."""
+    try:
+        return bool(sys.stderr.isatty())
+    except (AttributeError, OSError, ValueError):
+        return False
+
+
 class progress:
     """A progress bar on standard error where that is a terminal, otherwise a line now and then."""
 
@@ -104,7 +112,7 @@ class progress:
                 return {**known, "left": time_left(done, rest, known["elapsed"])}
 
         bar: list[Any] = []
-        terminal = sys.stderr is not None and sys.stderr.isatty()
+        terminal = _is_terminal()
 
         def start(what: str, total: float, done: float) -> None:
             if not terminal:

@@ -3,6 +3,7 @@
 Its chapters, in reading order:
 
 models, replicates, reduction     what a model records of a capture, and the statistics of that
+capture_replicates                the replicates of one capture
 laws, null_distribution           how cells scatter if the model is right; residuals
 contrasts                         patterns of all cells that are tested by themselves
 light_levels                      the nuisance parameter of every capture, from its total
@@ -32,6 +33,7 @@ named_fit                         `fit`: named parameters
 exact_likelihood, point_process   fits without simulation, where the likelihood has a closed form
 profile_likelihood                its maximum, and where it has fallen by a given amount
 budget, journal                   how much work a search may do; its replicates on disk, from which it goes on
-replicate_cache, memory           replicates that are kept for another measurement; the memory they take
+replicate_cache, own_code         replicates that are kept for another measurement; the user's code that made them
+memory                            the memory that replicates take
 levels                            what each decision costs in false alarms
 """

@@ -24,6 +24,7 @@ _LONG, _LONG_UNITS = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(min|h)\s*", re.ASCII),
 # The others are rules of thumb.
 # times the budget, by the clock: a longer run ends, because its machine is far slower than two idle cores
 _SLOW = 3.0
+_ROUNDING = 1e-9  # of the work: what is left of it when as much is subtracted in another order is none
 _DEFAULT, _QUICK = 600.0, 180.0  # s: the default budget, and that of a quick diagnosis
 # shares of the budget after which no further step, and no further fit or test of the steps, begins; the rest is for
 # the fits and tests, and for limits and advice
@@ -58,14 +59,14 @@ class Budget:
 
     @property
     def _simulated(self) -> float:
-        return self.spent - self.remembered
+        done = self.spent - self.remembered
+        return done if done > _ROUNDING * self.spent else 0.0
 
-    def spend(self, seconds: float, remembered: float = 0.0) -> None:
+    def spend(self, seconds: float) -> None:
         """Count some work before it is done.
 
         Args:
             seconds: the work, s of two idle cores.
-            remembered: the part of it whose result is in a cache.
         Raises:
             OutOfBudget: where it exceeds the share that may be spent now, or the run is late.
         """
@@ -74,7 +75,11 @@ class Budget:
             raise OutOfBudget
         if self._simulated > 0 and self.measured_from is None:
             self.measured_from = time.monotonic(), self._simulated
-        self.spent, self.remembered = self.spent + seconds, self.remembered + remembered
+        self.spent += seconds
+
+    def remember(self, seconds: float) -> None:
+        """Count work that was spent as found in a cache, s of two idle cores."""
+        self.remembered += seconds
 
     @property
     def left(self) -> float:

@@ -201,7 +201,8 @@ def _evaluate(
         # the entry does not depend on the data, but for the ticks that count
         if remember and sensors.alike and centre == stated and id not in before:
             sensor = sensors.of(id, 0)
-            rest = half, replicates.seed, replicates.dead, seen.early
+            cells = sorted((name, summary.values.size) for name, summary in seen.summaries.items())
+            rest = half, replicates.seed, replicates.dead, seen.early, cells
             entries[id] = replicate_cache.entry_name(sensor, seen.capture, *rest)
             found = replicate_cache.recall(entries[id])
             # a statistic that only a later replicate lacks is in none of a longer entry

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import disk
 from ..sensor import Sensor
 from . import replicate_cache
 from .capture_replicates import CaptureReplicates
@@ -26,8 +25,6 @@ FOLDER = ".replicates"  # in the folder of a diagnosis, while it is not finished
 # bytes of all entries, beyond which nothing is added, so that a search that goes on simulates more again: the quick
 # diagnosis of the tutorial, of two steps, writes 0.3 GB. A rule of thumb
 _MOST_BYTES = 2 << 30
-# bytes of one entry that is read or written, at most: the largest of the tutorial has 5 MB. A rule of thumb
-_LARGEST = 1 << 28
 
 
 class Journal:
@@ -63,29 +60,21 @@ class Journal:
 
     def recall(self, name: str | None) -> CaptureReplicates | None:
         """The replicates of this name; None where the journal has none that are intact."""
-        try:
-            return None if name is None else replicate_cache.unpacked(disk.read_file(self._path(name), _LARGEST))
-        except OSError:
-            return None
+        return None if name is None else replicate_cache.read_entry(self.folder, name)
 
     def keep(self, name: str | None, made: CaptureReplicates) -> None:
         """Add replicates. An error of the disk is ignored: they are simulated again."""
         if name is None or self.bytes > _MOST_BYTES:
             return
-        data = replicate_cache.packed(made)
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True)
-            if len(data) <= _LARGEST and self._own():
-                replicate_cache.write_entry(self.folder, name, data)
-                self.bytes += len(data)
+            if self._own():
+                self.bytes += replicate_cache.write_entry(self.folder, name, made)
 
     def remove(self) -> None:
         """Remove the journal: the search is finished."""
         if self._own():
             shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _path(self, name: str) -> Path:
-        return self.folder / f"{name}{replicate_cache.SUFFIX}"
 
     def _own(self) -> bool:
         """Whether the folder is there, and no link."""

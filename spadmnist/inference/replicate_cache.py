@@ -4,35 +4,44 @@ Another measurement of the same plan then costs one reduction, and what its own 
 
 The name of an entry is a digest of everything that it is a function of: sensor, capture, light, seed, the program's
 own sources and the user's plug-ins. An entry ends with the digest of its content. An entry that cannot be read, or is
-damaged, is simulated again. The oldest entries are removed when there are too many.
+damaged, is simulated again. What is too much is removed.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 import math
 import os
+import re
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import plugins
+from .. import disk, plugins, system
 from ..compiled import digest_of_sources
 from ..foreign import from_json
 from ..images import cache_folder
 from ..recording import Capture
 from ..sensor import Sensor
+from . import own_code
 from .capture_replicates import CaptureReplicates
 from .reduction import own_statistics
 
 SUFFIX = ".replicates"  # of the name of an entry's file
-# bytes of all entries together, and their number: the oldest of more are removed, and simulated anew. Some 200 entries
-# of 120 MB are those of four captures with 1.5 million time stamps. Rules of thumb
+LOOKS = ".looks"  # the same of a first look at a candidate
+# bytes of all entries together, and their number. What is over them is removed, and simulated anew: first looks before
+# replicates of the stated model, and the oldest first. Some 200 entries of 120 MB are those of four captures with 1.5
+# million time stamps. Rules of thumb
 _MOST_BYTES, _MOST_ENTRIES = 1 << 30, 4096
+_LARGEST = 1 << 28  # bytes of one entry that is read or written, at most: a quarter of all
+_SWEPT_AFTER = 1 << 27  # bytes that one process writes before it looks for too many: an eighth of all
+_UNFINISHED = 86_400.0  # s: a file that a killed process left unfinished is removed after so long
+_NUMBERS = re.compile(r"[<>|=][fiu][1248]")  # the types of arrays in an entry
+_written = 0  # bytes since the last look
 
 
 def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:
@@ -41,15 +50,12 @@ def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:
     Args:
         more: numbers and words that the replicates depend on as well.
     """
-    own = {cls for cls in [*map(type, sensor.effects), *own_statistics()] if plugins.is_own(cls)}
-    texts = [_text(plugins.source_file(cls)) for cls in sorted(own, key=lambda cls: cls.__module__)]
-    # a notebook has no file; what a function makes depends on what it was called with
-    if any(cls.__module__ == "__main__" or "<locals>" in cls.__qualname__ for cls in own) or None in texts:
+    code = own_code.digested({cls for cls in [*map(type, sensor.effects), *own_statistics()] if plugins.is_own(cls)})
+    if code is None:
         return None
     digest = hashlib.sha256(digest_of_sources().encode())
-    for _, text in sorted(plugins.loaded_files().items()):
-        digest.update(text.encode())
-    digest.update("".join(filter(None, texts)).encode())
+    for part in code:
+        digest.update(b"%d " % len(part) + part)
     # of a part of a chip: the whole chip, whose other pixels may matter, and the part's place
     chip = sensor.chip or sensor
     places = None if chip.layout.positions is None else chip.layout.positions.tobytes()
@@ -57,59 +63,74 @@ def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:
     for effect in chip.effects:
         digest.update(effect.name.encode())
         for name in effect.parameters:
-            value = getattr(effect, name)
-            digest.update(name.encode() + (value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()))
+            digest.update(name.encode() + _bytes_of(getattr(effect, name)))
     return digest.hexdigest()[:32]
 
 
-@functools.cache
-def _text(file: str) -> str | None:
-    """The text of a module, as it was when this process first needed it; None where it cannot be read."""
-    try:
-        return Path(file).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return None
+def _bytes_of(value: Any) -> bytes:
+    """A parameter's value as bytes. The text of anything like an array leaves numbers out."""
+    if not np.ndim(value):
+        return repr(value).encode()
+    array = np.ascontiguousarray(value)
+    return repr((array.dtype.str, array.shape)).encode() + array.tobytes()
 
 
-def recall(name: str | None) -> CaptureReplicates | None:
+def recall(name: str | None, suffix: str = SUFFIX) -> CaptureReplicates | None:
     """The replicates of an entry; None where no such entry can be read."""
     if name is None:
         return None
-    path = nulls_folder() / f"{name}{SUFFIX}"
-    try:
-        found = unpacked(path.read_bytes())
-        os.utime(path)
-    except OSError:
-        return None
+    found = read_entry(nulls_folder(), name, suffix)
+    if found is not None:
+        with contextlib.suppress(OSError):
+            os.utime(nulls_folder() / f"{name}{suffix}")
     return found
 
 
-def keep(name: str | None, made: CaptureReplicates) -> None:
-    """Write an entry; `make_room` is for the caller. An error of the disk is ignored: no result depends on it."""
+def keep(name: str | None, made: CaptureReplicates, suffix: str = SUFFIX) -> None:
+    """Write an entry. An error of the disk is ignored: no result depends on it."""
+    global _written
     if name is None:
         return
     with contextlib.suppress(OSError):  # what is not in the cache is simulated again
         nulls_folder().mkdir(parents=True, exist_ok=True)
-        write_entry(nulls_folder(), name, packed(made))
+        _written += write_entry(nulls_folder(), name, made, suffix)
+    if _written > _SWEPT_AFTER:
+        make_room()
 
 
-def write_entry(folder: Path, name: str, data: bytes) -> None:
+def read_entry(folder: Path, name: str, suffix: str = SUFFIX) -> CaptureReplicates | None:
+    """The replicates of an entry of a folder; None where it has none that is intact and has this name."""
+    try:
+        return unpacked(disk.read_file(folder / f"{name}{suffix}", _LARGEST), name)
+    except OSError:
+        return None
+
+
+def write_entry(folder: Path, name: str, made: CaptureReplicates, suffix: str = SUFFIX) -> int:
     """Write an entry, there as a whole or not at all; its digest tells what a power cut left of it.
 
+    Returns:
+        Bytes; 0 of one that is too large, which is not written.
     Raises:
         OSError: where it cannot be written.
     """
-    part = folder / f"{name}.{os.getpid()}.part"  # of another process that writes the same entry it is another file
+    data = packed(made, name)
+    if len(data) > _LARGEST:
+        return 0
+    part = folder / f".{name}.{os.getpid()}.part"  # of another process that writes the same entry it is another file
     try:
-        part.write_bytes(data)
-        os.replace(part, folder / f"{name}{SUFFIX}")
-    except OSError:
+        flags = system.WRITE | os.O_CREAT | os.O_TRUNC | system.NO_LINK | system.NO_WAIT
+        with open(os.open(part, flags, 0o666), "wb") as file:
+            file.write(data)
+        os.replace(part, folder / f"{name}{suffix}")
+    except BaseException:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise
+    return len(data)
 
 
-def packed(made: CaptureReplicates) -> bytes:
+def packed(made: CaptureReplicates, name: str) -> bytes:
     """Replicates as the bytes of an entry: a line of JSON that says what follows, the arrays, and a digest of all."""
     arrays = {"numbers": made.numbers, "totals": made.totals}
     for statistic, (_, scale) in made.laws.items():
@@ -117,6 +138,7 @@ def packed(made: CaptureReplicates) -> bytes:
         if scale is not None:
             arrays[f"scale/{statistic}"] = scale
     facts = {
+        "name": name,
         "laws": {statistic: law for statistic, (law, _) in made.laws.items()},
         "arrays": {name: [x.dtype.str, list(x.shape)] for name, x in arrays.items()},
     }
@@ -124,15 +146,19 @@ def packed(made: CaptureReplicates) -> bytes:
     return data + hashlib.sha256(data).digest()
 
 
-def unpacked(data: bytes) -> CaptureReplicates | None:
-    """The replicates that an entry's bytes hold; None where they are damaged."""
+def unpacked(data: bytes, name: str) -> CaptureReplicates | None:
+    """The replicates that an entry's bytes hold; None where they are damaged, or those of an entry of another name."""
     try:
         head, rest = _intact(data)
         facts, arrays, at = from_json(head), {}, 0
-        for name, (kind, shape) in facts["arrays"].items():
+        if facts["name"] != name:
+            return None
+        for key, (kind, shape) in facts["arrays"].items():
+            if not _NUMBERS.fullmatch(kind):
+                return None
             number = math.prod(shape)
-            arrays[name] = np.frombuffer(rest, np.dtype(kind), number, at).reshape(shape).copy()
-            at += arrays[name].nbytes
+            arrays[key] = np.frombuffer(rest, np.dtype(kind), number, at).reshape(shape).copy()
+            at += arrays[key].nbytes
         laws = {statistic: (str(law), arrays.get(f"scale/{statistic}")) for statistic, law in facts["laws"].items()}
         values = {statistic: arrays[f"values/{statistic}"].astype(np.float64, copy=False) for statistic in laws}
         return CaptureReplicates(numbers=arrays["numbers"], totals=arrays["totals"], values=values, laws=laws)
@@ -163,17 +189,25 @@ def _intact(data: bytes) -> tuple[bytes, memoryview]:
 
 
 def make_room() -> None:
-    """Remove the oldest entries beyond the most that are kept."""
-    facts = {}
-    for path in nulls_folder().glob("[!.]*"):  # those of earlier programs, too, and none that is being written
-        with contextlib.suppress(FileNotFoundError):
-            facts[path] = path.stat()
+    """Remove what is over the most that is kept. An error of the disk is ignored: no result depends on it."""
+    global _written
+    _written = 0
+    found: list[tuple[bool, float, int, str]] = []  # (first look, age, bytes, path)
+    with contextlib.suppress(OSError), os.scandir(nulls_folder()) as entries:
+        for entry in entries:
+            with contextlib.suppress(OSError):
+                facts = entry.stat(follow_symlinks=False)
+                age = time.time() - facts.st_mtime
+                if not entry.name.startswith("."):  # those of earlier programs, too
+                    found.append((entry.name.endswith(LOOKS), age, facts.st_size, entry.path))
+                elif entry.name.endswith(".part") and age > _UNFINISHED:
+                    os.unlink(entry.path)
     total = 0
-    for number, path in enumerate(sorted(facts, key=lambda path: facts[path].st_mtime, reverse=True)):
-        total += facts[path].st_size
+    for number, (_, _, size, path) in enumerate(sorted(found)):
+        total += size
         if total > _MOST_BYTES or number >= _MOST_ENTRIES:
             with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
+                os.unlink(path)
 
 
 def nulls_folder() -> Path:

@@ -255,7 +255,9 @@ class Replicates:
     def charge(self, sensor: Sensor, id: str, number: int) -> None:
         """Spend the work of replicates that are remembered: an answer does not depend on what is in the cache."""
         work = number * self.work_of(sensor, id)
-        self.budget.spend(work, remembered=work)
+        self.budget.spend(work)
+        self.budget.remember(work)
+        self.simulations += number
 
     def work_of(self, sensor: Sensor, id: str) -> float:
         """The work of one replicate of a capture, s of two idle cores."""
@@ -281,7 +283,7 @@ class Replicates:
             pieces: number of tasks for each capture.
             hasty: without costly statistics.
             names: of each, the statistics that are reduced; all where it is empty.
-            remember: of each, whether the cache on disk is read and written: another measurement will ask for it.
+            remember: of each, whether it is a first look at a candidate of the stated model, which is kept on disk.
         Raises:
             OutOfBudget: where the budget does not allow them.
         """
@@ -298,7 +300,7 @@ class Replicates:
             try:
                 sensors = [model.of(id, int(number)) for number in ([0] if model.alike else numbers)]
                 if self.journal is not None or cached[k]:
-                    more = self.seed, self.dead, pieces, hasty, *sorted(some_of[k])
+                    more = self.seed, self.dead, pieces, hasty, sorted(cells.items()), *sorted(some_of[k])
                     entries[k] = Journal.name(sensors, self.seen[id], photons, numbers, *more)
                 if len(numbers):
                     most = max(most, self._bytes(sensors[0], id, photons))
@@ -324,14 +326,16 @@ class Replicates:
             except UNABLE as error:
                 tasks[k], out[k] = [], CannotSimulate.because(error)
         self.budget.spend(sum(work))
+        found = 0.0  # of the work
         self.simulations += sum(len(numbers) for some, (_, _, _, numbers) in zip(tasks, wanted, strict=True) if some)
         for k, some in enumerate(tasks):
             before = self.journal.recall(entries[k]) if some and self.journal else None
             if some and before is None and cached[k]:
-                before = replicate_cache.recall(entries[k])
+                before = replicate_cache.recall(entries[k], replicate_cache.LOOKS)
             if before is not None:
                 tasks[k], out[k] = [], before
-                self.budget.remembered += work[k]
+                found += work[k]
+        self.budget.remember(found)
         owners = [k for k, some in enumerate(tasks) for _ in some]
         given = {f"replicates of {wanted[k][1]} ({n + 1} of {len(owners)})": n for n, k in enumerate(owners)}
         every = [task for some in tasks for task in some]
@@ -349,7 +353,7 @@ class Replicates:
                 if self.journal and isinstance(whole, CaptureReplicates):
                     self.journal.keep(entries[k], whole)
                 if cached[k] and isinstance(whole, CaptureReplicates):
-                    replicate_cache.keep(entries[k], whole)
+                    replicate_cache.keep(entries[k], whole, replicate_cache.LOOKS)
 
         self._limited(most).run(_simulate, lambda keys: (every[given[key]] for key in keys), list(given), done)
         if any(cached[k] for k in owners):
