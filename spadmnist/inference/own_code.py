@@ -45,7 +45,8 @@ def digested(own: Collection[type]) -> list[bytes] | None:
 def _modules(packages: Collection[str]) -> Iterator[tuple[str, str]]:
     """(name, file) of each of the user's modules, and of each module of some packages."""
     for name, module in sorted(sys.modules.items()):
-        file, package = getattr(module, "__file__", None), name.partition(".")[0]
+        # what is no module may stand there, and a lazy one is not to be loaded for this
+        file, package = getattr(module, "__dict__", {}).get("__file__"), name.partition(".")[0]
         if not isinstance(file, str) or name == "__main__" or package == plugins.__package__:
             continue
         if package in packages or not (file.startswith(_installed()) or plugins.is_module_of_file(name)):
