@@ -87,6 +87,39 @@ def test_crosstalk_is_found():
     assert found.after < 1.3 < found.before
 
 
+@pytest.mark.slow
+@pytest.mark.long
+def test_two_populations_of_traps_are_two_steps():
+    """No single lifetime explains its own cells; each of the two does, beside the other."""
+    effects = [
+        sp.effects.Detection(pdp=0.5),
+        sp.effects.DarkCounts(rate=200.0),
+        sp.effects.DeadTime(duration=50e-9),
+        sp.effects.Tdc(resolution=1e-10),
+    ]
+    hidden = {
+        "afterpulsing": {"probability": 0.02, "lifetime": 40e-9},
+        "slow_afterpulsing": {"probability": 0.02, "lifetime": 4e-6},
+    }
+    sensor = sp.Sensor(sp.Layout(4, 4, 25e-12, 1.0), effects, rules="device")
+    more = [Effect.registry.find(name)(**values) for name, values in hidden.items()]
+    photon = 6.62607015e-34 * 299792458.0 / 500e-9  # J
+    lit = {"wavelength": 500e-9, "relative_uncertainty": 0.02}
+    captures = [
+        sp.Capture("dark", "tr", dark=True, exposure=2.0),
+        sp.Capture("dim", "tr", exposure=0.5, irradiance=2e4 * photon / 25e-12, **lit),
+        sp.Capture("lit", "tr", exposure=0.2, irradiance=1e5 * photon / 25e-12, **lit),
+        sp.Capture("bright", "tr", exposure=0.03, irradiance=6e5 * photon / 25e-12, **lit),
+    ]
+    data = sp.simulate(sensor.changed(effects=[*effects, *more]), captures, seed=3)
+    found = diagnose(sensor, data, quick=True)
+    assert found.verdict == "explained" and found.after < 1.1 < 1.4 < found.steps[0].misfit < found.before
+    assert {step.candidate.name for step in found.steps} == {f"add {name}" for name in hidden}
+    for step in found.steps:
+        for parameter, value in hidden[step.candidate.effect].items():
+            assert step.values[parameter].low < value < step.values[parameter].high
+
+
 def test_candidates_come_from_the_registry(tmp_path):
     file = tmp_path / "sensor.yaml"
     file.write_text(SENSOR)
