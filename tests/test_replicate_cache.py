@@ -181,6 +181,9 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(Effect.registry, "classes", dict(Effect.registry.classes))
     monkeypatch.setattr(plugins, "IMPORTED", 2e9)  # as if the tests were older, too
+    for name, module in list(sys.modules.items()):  # of tests before this one, whose files are gone
+        if isinstance(file := vars(module).get("__file__"), str) and not os.path.exists(file):
+            monkeypatch.delitem(sys.modules, name)
     yield package
     for name in [name for name in sys.modules if name.partition(".")[0] == "mylab"]:
         del sys.modules[name]

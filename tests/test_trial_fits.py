@@ -218,7 +218,7 @@ def test_a_look_at_all_captures_is_one_at_those_that_were_left_out(lab, monkeypa
     known = Trial(candidate, {CROSSTALK: 0.05}, Signature({flat: np.full(size, 3.0)}, {}, {}), 0.0, 1.0, seen={"flat"})
     asked: list[Any] = []
 
-    def simulated(self: Scan, evaluation: Any, tried: Any, few: int = 2, only: Any = ()) -> list[Trial]:
+    def simulated(self: Scan, evaluation: Any, tried: Any, few: int = 2, only: Any = (), **_: Any) -> list[Trial]:
         asked.append(list(only))
         for one in tried:
             one.signature = Signature(
