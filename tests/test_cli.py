@@ -691,7 +691,10 @@ def test_no_warning_of_a_library_reaches_a_user(
 
 
 def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Where standard error is no terminal, what takes longer than 10 s says every 30 s how far it is."""
+    """Where standard error is no terminal, what takes longer than 10 s says every 30 s how far it is.
+
+    The first work, which compiles, says nothing of the rest.
+    """
     from spadmnist.cli import _terminal
 
     now = 0.0
@@ -702,8 +705,26 @@ def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: 
             progress.advance(1.0 if now < 99 else 47.5, "lit")
     assert capsys.readouterr().err.splitlines() == [
         "comparing 3%, 12.0 s, 6.5 min left",
-        "comparing 5%, 43.0 s, 13.6 min left",
-        "comparing 52%, 99.0 s, 89.6 s left",
+        "comparing 5%, 43.0 s, 15.4 min left",
+        "comparing 52%, 99.0 s, 87.6 s left",
+    ]
+
+
+def test_a_log_says_soon_what_it_did_not_know(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from spadmnist.cli import _terminal
+
+    now = 0.0
+    monkeypatch.setattr(_terminal.time, "monotonic", lambda: now)
+    with _terminal.progress() as progress:
+        progress.start("comparing", 100.0, 0.0)
+        for moment in (58.0, 60.0, 68.0, 70.0, 97.0):
+            now = moment
+            progress.advance(2.0, "lit")
+    assert capsys.readouterr().err.splitlines() == [
+        "comparing 2%, 58.0 s, estimating",
+        "comparing 6%, 68.0 s, 3.9 min left",
     ]
 
 

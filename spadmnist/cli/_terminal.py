@@ -46,6 +46,7 @@ def duration(seconds: float) -> str:
 
 
 _KNOWN_SHARE = 0.02  # of the work; with less done the first, slow part (start of workers, compiling) is the estimate
+_UNKNOWN = "estimating"
 _KNOWN_AFTER = (2.0, 30.0)  # s: no time left is shown before the first; after the second it is, however little is done
 
 
@@ -55,29 +56,32 @@ def time_left(done: float, rest: float, elapsed: float) -> str:
     share = done / (done + rest) if done > 0 else 0.0
     if share > 0 and (elapsed >= late or (elapsed >= soon and share >= _KNOWN_SHARE)):
         return f"{duration(rest * elapsed / done)} left"
-    return "estimating"
+    return _UNKNOWN
 
 
-_LOG_EVERY = (10.0, 30.0)  # s: a log has its first line after so long, the others so long after each other
+# s from one line of a log to the next: the first ones, until the time left is known, and the others
+_LOG_EVERY = (10.0, 30.0)
 
 
 class _Log:
     """In place of a bar, where standard error is no terminal: now and then a line with the time left."""
 
     def __init__(self, what: str, total: float, done: float):
-        self.what, self.total, self.done, self.before = what, total, done, done
+        self.what, self.total, self.done = what, total, done
         self.began = time.monotonic()
+        # the end of the first work and what was done then: the start of workers and compiling say nothing of the rest
+        self.first: tuple[float, float] | None = None
         self.due = self.began + _LOG_EVERY[0]
 
     def update(self, work: float) -> None:
         self.done += work
         now = time.monotonic()
+        since, before = self.first = self.first or (now, self.done)
         if now < self.due or self.done >= self.total:
             return
-        self.due = now + _LOG_EVERY[1]
-        elapsed = now - self.began
-        left = time_left(self.done - self.before, self.total - self.done, elapsed)
-        say(f"{self.what} {self.done / self.total:.0%}, {duration(elapsed)}, {left}")
+        left = time_left(self.done - before, self.total - self.done, now - since)
+        say(f"{self.what} {self.done / self.total:.0%}, {duration(now - self.began)}, {left}")
+        self.due = now + _LOG_EVERY[left != _UNKNOWN]
 
     def set_postfix_str(self, note: str, refresh: bool) -> None:
         """A line has room for the time alone."""
