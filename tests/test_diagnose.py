@@ -90,7 +90,7 @@ def test_crosstalk_is_found():
 @pytest.mark.slow
 @pytest.mark.long
 def test_two_populations_of_traps_are_two_steps():
-    """No single lifetime explains its own cells; each of the two does, beside the other."""
+    """A sensor with two populations of traps: each is a step of its own, and all intervals cover the truth."""
     effects = [
         sp.effects.Detection(pdp=0.5),
         sp.effects.DarkCounts(rate=200.0),

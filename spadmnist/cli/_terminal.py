@@ -46,8 +46,10 @@ def duration(seconds: float) -> str:
 
 
 _KNOWN_SHARE = 0.02  # of the work; with less done the first, slow part (start of workers, compiling) is the estimate
-_UNKNOWN = "estimating"
 _KNOWN_AFTER = (2.0, 30.0)  # s: no time left is shown before the first; after the second it is, however little is done
+
+
+_UNKNOWN = "estimating"  # in place of the time left, until it is known
 
 
 def time_left(done: float, rest: float, elapsed: float) -> str:
@@ -59,7 +61,8 @@ def time_left(done: float, rest: float, elapsed: float) -> str:
     return _UNKNOWN
 
 
-# s from one line of a log to the next: the first ones, until the time left is known, and the others
+# s from one line of a log to the next: until the time left is known, and then. Often enough to see that a run goes on,
+# and few lines for one of hours; a rule of thumb
 _LOG_EVERY = (10.0, 30.0)
 
 

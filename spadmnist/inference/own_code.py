@@ -1,4 +1,4 @@
-"""The user's own code as bytes: what simulations depend on beside the program's own sources."""
+"""The user's own code, on which the simulations depend as well as on the sources of this program."""
 
 from __future__ import annotations
 
@@ -62,5 +62,5 @@ def _installed() -> tuple[str, ...]:
 
 @functools.lru_cache(maxsize=1024)
 def _content(file: str, changed: int) -> bytes:
-    """The content of a file that changed at this time, ns."""
+    """The content of a file; it is read again where its time of change, in ns, is another one."""
     return Path(file).read_bytes()

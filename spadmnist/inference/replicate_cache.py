@@ -1,10 +1,10 @@
 """The cache of replicates on disk: of a model as it is stated, and of its candidates where they are tried first.
 
-Another measurement of the same plan then costs one reduction, and what its own search asks for.
+A comparison of another measurement of the same plan then costs one reduction. A diagnosis of it costs its fits.
 
 The name of an entry is a digest of everything that it is a function of: sensor, capture, light, seed, the program's
 own sources and the user's plug-ins. An entry ends with the digest of its content. An entry that cannot be read, or is
-damaged, is simulated again. What is too much is removed.
+damaged, is simulated again. Where there are too many, first looks are removed first, and the oldest first.
 """
 
 from __future__ import annotations
@@ -32,16 +32,15 @@ from .capture_replicates import CaptureReplicates
 from .reduction import own_statistics
 
 SUFFIX = ".replicates"  # of the name of an entry's file
-LOOKS = ".looks"  # the same of a first look at a candidate
-# bytes of all entries together, and their number. What is over them is removed, and simulated anew: first looks before
-# replicates of the stated model, and the oldest first. Some 200 entries of 120 MB are those of four captures with 1.5
-# million time stamps. Rules of thumb
+LOOKS = ".looks"  # the same of an entry that is a first look at a candidate
+# bytes of all entries together, and their number: more are removed, and simulated anew. A plan of four captures with
+# 1.5 million time stamps has some 200 entries, 120 MB together. Rules of thumb
 _MOST_BYTES, _MOST_ENTRIES = 1 << 30, 4096
-_LARGEST = 1 << 28  # bytes of one entry that is read or written, at most: a quarter of all
-_SWEPT_AFTER = 1 << 27  # bytes that one process writes before it looks for too many: an eighth of all
-_UNFINISHED = 86_400.0  # s: a file that a killed process left unfinished is removed after so long
+_LARGEST = 1 << 28  # bytes of one entry that is read or written, at most: a quarter of all; a rule of thumb
+_SWEPT_AFTER = 1 << 27  # bytes that one process writes before it counts all entries: an eighth of all; a rule of thumb
+_UNFINISHED = 86_400.0  # s: a file that a killed process left unfinished is removed after so long; a rule of thumb
 _NUMBERS = re.compile(r"[<>|=][fiu][1248]")  # the types of arrays in an entry
-_written = 0  # bytes since the last look
+_written = 0  # bytes that this process has written since it counted all entries
 
 
 def entry_name(sensor: Sensor, capture: Capture, *more: Any) -> str | None:
