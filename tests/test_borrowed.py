@@ -62,6 +62,7 @@ def test_what_changes_the_mean_unsaid_borrows_nothing(lab, monkeypatch) -> None:
     assert not evaluate(replicates, {}, sensors, near=(base, [])).borrowed
 
 
+@pytest.mark.slow
 def test_a_step_is_weighed_where_it_shows_and_complete_before_the_end(lab) -> None:
     """More dark counts are the same pattern in the dark; it is simulated when all numbers are fitted together."""
     made = lab("", light=400)

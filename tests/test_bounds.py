@@ -87,6 +87,7 @@ def test_a_chunk_unpacks_to_no_more_than_its_shape(tmp_path: Path) -> None:
     assert whole.events is not None and len(whole.events) == 1000
 
 
+@pytest.mark.slow
 def test_a_bomb_takes_no_memory(tmp_path: Path) -> None:
     bomb(tmp_path / "lab", 2 << 30)
     program = (

@@ -97,6 +97,7 @@ if __name__ == "__main__":
 '''
 
 
+@pytest.mark.slow
 def test_classes_of_the_program_itself_work_with_workers(tmp_path: Path) -> None:
     file = tmp_path / "program.py"
     file.write_text(PROGRAM)

@@ -220,6 +220,7 @@ def test_the_generator_shares_no_code_with_the_package() -> None:
 # ---- strengths and their significance ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_case_can_be_built_and_meets_its_tier() -> None:
     for case in hidden.all_cases(4):
         if case.tier in ("obvious", "moderate", "below"):

@@ -112,6 +112,7 @@ def test_what_belongs_to_a_measurement_is_no_option_of_a_dataset(made: tuple[Pat
     assert tree(made[1]) == before and result.stdout == ""
 
 
+@pytest.mark.slow
 def test_json_is_all_that_stands_on_standard_output(made: tuple[Path, Path], tmp_path: Path) -> None:
     file, root = made
     commands: list[tuple[Any, ...]] = [
@@ -185,6 +186,7 @@ def test_a_full_standard_error_does_no_harm(command: str, made: tuple[Path, Path
     assert result.stdout
 
 
+@pytest.mark.slow
 def test_an_error_that_cannot_be_said_keeps_its_status() -> None:
     for redirected in ("2> /dev/full", "2>&-", "> /dev/full 2>&1", ">&- 2>&-"):
         assert shell(f"spadmnist verify /nonexistent {redirected}").returncode == 2, redirected
@@ -280,6 +282,7 @@ def test_dry_run_says_what_is_there(made: tuple[Path, Path], tmp_path: Path) -> 
     assert "generate would stop" in said() and "config.yaml: this file is missing" in said()
 
 
+@pytest.mark.slow
 def test_a_sheet_replaces_pictures_alone(made: tuple[Path, Path], tmp_path: Path) -> None:
     sheet = tmp_path / "sheet.png"
     for content in (None, b""):

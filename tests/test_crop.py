@@ -574,6 +574,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_measured_part_is_compared_with_that_part(lab: Path) -> None:
     """The right part is adequate; the whole is refused, with a line to type; another part fails, by its map."""
     line = ["compare", "sensor.yaml", "lab", "--jobs", "1", "--crop"]
@@ -636,6 +637,7 @@ def test_the_next_sensor_describes_the_whole_chip(lab: Path, tmp_path: Path) -> 
     assert np.array_equal(rate[:16], whole.effect("dark_counts").rate.reshape(64, 64)[:16])
 
 
+@pytest.mark.slow
 def test_a_fit_and_a_diagnosis_say_which_part_they_are_of(tmp_path: Path) -> None:
     """A map is found in a part of 3 x 3 pixels; the new file has it there, and the stated rate elsewhere."""
     few = SENSOR.replace("rows: 64, columns: 64", "rows: 6, columns: 6").replace(

@@ -169,6 +169,7 @@ def test_a_task_that_kills_is_named_when_all_others_are_done(workers: Executor) 
     assert found == {n: n for n in range(8) if n != 2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", ["loky", "stand-in"], indirect=True)
 def test_where_all_workers_die_not_every_task_is_tried(workers: Executor) -> None:
     tried = 0

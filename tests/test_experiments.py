@@ -241,6 +241,7 @@ def test_accuracies_of_every_method_and_level(digits: Path) -> None:
     assert (again.made, again.kept) == (0, len(keys))
 
 
+@pytest.mark.slow
 @with_torch
 def test_two_workers_find_the_same(digits: Path) -> None:
     """And so does a run that was interrupted."""

@@ -459,6 +459,7 @@ def test_what_cannot_be_fitted_is_told_with_what_can(made):
         named_candidate(*known, "set", "crosstalk", "probability")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "hidden", "stated", "exposure"),
     [

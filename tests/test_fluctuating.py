@@ -136,6 +136,7 @@ def test_a_lamp_is_missed_where_it_made_the_totals_wider(lab, contrast: float) -
     assert names(path) == ["add source_noise", "add crosstalk"][0 if contrast else 1 :]
 
 
+@pytest.mark.slow
 def test_numbers_of_a_lamp_that_fluctuates_are_followed_by_many_recordings(lab, monkeypatch) -> None:
     """Of any other model a few recordings tell how the cells follow its numbers: they are the same in each.
 

@@ -298,6 +298,7 @@ def test_names_are_safe_and_no_two_the_same(tmp_path: Path) -> None:
     assert {f"{name.removesuffix('.counts.npy')}.h5" for name in found.names} == {p.name for p in written.glob("*.h5")}
 
 
+@pytest.mark.slow
 def test_nothing_of_others_is_written_over(lab: measurement.Measurement, tmp_path: Path) -> None:
     found, out = fluxes.of_measurement(lab), tmp_path / "out"
     fluxes.write(found, out)
@@ -386,6 +387,7 @@ def test_a_sheet_ends_somewhere(tmp_path: Path) -> None:
 # --- the command --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_measurement_from_the_command_line(lab: measurement.Measurement, tmp_path: Path) -> None:
     (tmp_path / "sensor.yaml").write_text(YAML)
     done = commands.run(

@@ -262,6 +262,7 @@ def test_a_later_step_may_add_what_a_map_needs() -> None:
     assert not rests_on(adds, maps, path) and not rests_on(maps, other, path)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_fitted_as_a_step_is_tried_once(monkeypatch) -> None:
     """A map is made anew for every look: it is excluded from the model that it was added to, lest there be no end."""
     gains = np.exp(np.random.default_rng(2).normal(0, 0.5, 16))

@@ -331,6 +331,7 @@ def test_an_answer_in_a_notebook_tells_the_misfits_apart(kind: type[Any]) -> Non
     assert "sample" not in kind(found, sensor())._repr_html_()
 
 
+@pytest.mark.slow
 def test_a_fit_has_values_intervals_and_covariance(asked: tuple[Any, Any], tmp_path: Path) -> None:
     model, data = asked
     path, source = data.save(tmp_path / "lab"), sensor_file.save(model, tmp_path / "sensor.yaml")
@@ -356,6 +357,7 @@ def test_a_fit_has_values_intervals_and_covariance(asked: tuple[Any, Any], tmp_p
         sp.fit(model, data, free="dark_counts.rate")
 
 
+@pytest.mark.slow
 def test_a_diagnosis_gives_the_model_that_it_found(asked: tuple[Any, Any], tmp_path: Path) -> None:
     model, data = asked
     found = sp.diagnose(model, data, quick=True, jobs=1, max_steps=1)

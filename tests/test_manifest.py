@@ -67,6 +67,7 @@ def use(root: Path) -> None:
                 _ = method.normalised[0]
 
 
+@pytest.mark.slow
 def test_every_entry_is_checked(root: Path) -> None:
     """Whatever is left out or put in its place is a sentence, or changes nothing that is read."""
     good = json.loads((root / "manifest.json").read_bytes())

@@ -42,6 +42,7 @@ def both_added(path: ModelPath) -> None:
     taken(path, "add crosstalk", {CROSSTALK: 0.02})
 
 
+@pytest.mark.slow
 def test_the_fit_of_a_later_step_uses_the_columns_that_are_known(lab) -> None:
     """With as many simulations as the squares need; once all steps are there, the Jacobian is simulated with all."""
     path = begin(bench_of(lab(BOTH), 32))
@@ -80,6 +81,7 @@ def test_the_fit_of_a_later_step_uses_the_columns_that_are_known(lab) -> None:
     assert path.approximate and path.fit is first
 
 
+@pytest.mark.slow
 def test_columns_of_another_model_do_not_end_a_fit(lab) -> None:
     """Where the squares do not fall as the known columns say, the Jacobian is simulated."""
     path = begin(bench_of(lab(BOTH), 16))
@@ -153,6 +155,7 @@ def test_where_the_first_group_leads_nowhere_the_next_one_is_fitted(lab, monkeyp
     assert asked[0] == "add crosstalk"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("apart", [False, True])
 def test_a_trace_that_nothing_explains_forbids_no_step_of_another_one(lab, monkeypatch, apart: bool) -> None:
     """The second look has the largest trace alone; its best candidate explains nothing when it is fitted."""
@@ -180,6 +183,7 @@ def test_a_trace_that_nothing_explains_forbids_no_step_of_another_one(lab, monke
     assert apart or len(path.evaluation.replicate_residuals[TOTALS]) > 16  # then more replicates are made
 
 
+@pytest.mark.slow
 def test_signatures_of_the_first_look_are_used_again(lab) -> None:
     """Those of the effect that was added are not, nor those whose cells scatter in another way now."""
     replicates = bench_of(lab(BOTH), 16)
@@ -233,6 +237,7 @@ def test_a_periodic_signature_is_simulated_once_for_a_line(lab) -> None:
     assert replicates.simulations > done
 
 
+@pytest.mark.slow
 def test_a_map_that_is_clearly_needed_stays_without_another_fit(lab) -> None:
     extra = "    afterpulsing: {probability: 5 %, lifetime: 60 ns}\n"
     sensor, data = lab(extra, light=400, side=4)
@@ -273,6 +278,7 @@ def test_a_map_makes_no_cascade_that_does_not_end() -> None:
     assert bounds_of(("detection", "pdp")) == (0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_what_does_not_compete_is_added_without_another_scan(lab, monkeypatch) -> None:
     """Its signature is that of the second look; a new scan would find the same trial."""
     path = begin(bench_of(lab(BOTH + FLICKER, light=400), 16))
@@ -285,6 +291,7 @@ def test_what_does_not_compete_is_added_without_another_scan(lab, monkeypatch) -
     assert len(scans) < 3
 
 
+@pytest.mark.slow
 def test_a_step_stays_while_another_one_changes_a_number_of_its_effect(lab) -> None:
     """Without the effect, the number is that of none."""
     path = begin(bench_of(lab("    jitter: {sigma: 2 ns, tail_weight: 0.3, tail: 4 ns}\n", light=400), 16))

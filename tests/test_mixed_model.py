@@ -46,6 +46,7 @@ def test_a_gradient_is_a_gradient_and_no_pattern_of_rows(slope: float, spread: f
     assert found["rows"].given_pixels > 12 and found["rows"].given_pixels > found["gradient"].given_pixels + 5
 
 
+@pytest.mark.slow
 def test_what_chance_has_of_patterns_has_no_evidence() -> None:
     """Of 100 maps whose pixels differ, none has evidence of 12 for a pattern: 18 in chi square, 3 numbers (4e-4)."""
     rng = np.random.default_rng(5)

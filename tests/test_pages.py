@@ -520,6 +520,7 @@ def test_a_thousand_captures_are_still_a_page(tmp_path: Path) -> None:
     assert "The 4000 clearest of 12000" in Parts(path.read_text()).text
 
 
+@pytest.mark.slow
 def test_other_peoples_files_stay(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     pages.comparison(adequate(), tmp_path)

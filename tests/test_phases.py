@@ -87,6 +87,7 @@ def test_the_other_phase_with_the_same_total() -> None:
     assert swing.mirror_phase("flat", math.pi / 2, 0.3) == math.pi / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.3, math.pi - 0.3])
 def test_a_capture_shorter_than_a_swing_rises_or_falls(lab, monkeypatch, phase: float) -> None:
     """A tenth of a period: its total is the same for both phases, and no single cell of a few recordings tells."""

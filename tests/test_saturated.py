@@ -286,6 +286,7 @@ def test_first_stamps_inform_a_map_however_bright_the_light(number: float) -> No
     assert known.mean() > 100
 
 
+@pytest.mark.slow
 def test_a_capture_whose_counters_are_full_tells_nothing_of_the_pixels() -> None:
     """5 % of PDP spread, seen by a flat of 5000 counts a pixel, beside one in which every counter is full."""
     pdp = 0.3 * np.exp(0.05 * np.random.default_rng(4).standard_normal(64))

@@ -703,6 +703,7 @@ def test_an_edge_that_is_thought_to_be_far_off_is_tried_where_it_was_seen_too(la
 # --- another measurement of the plan -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_another_measurement_of_the_plan_finds_what_the_first_one_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -213,6 +213,7 @@ def test_a_change_that_needs_the_set_up_is_a_tie_however_well_it_fits(tmp_path, 
     assert [step.candidate.name for step in found.steps] == ["add background_light"]
 
 
+@pytest.mark.slow
 def test_a_capture_that_stopped_early_is_told_with_its_length(tmp_path):
     data = lab(tmp_path, plan=LAB.replace("400 ms", "360 ms"))
     text = (tmp_path / "lab" / "measurement.yaml").read_text()
@@ -239,6 +240,7 @@ def test_what_swings_is_found_with_its_frequency_and_its_phases(tmp_path):
     assert values["frequency"].low < 120 < values["frequency"].high
 
 
+@pytest.mark.slow
 def test_a_model_that_swings_is_not_wrong_for_its_phase(tmp_path):
     """Nobody knows where a lamp's phase is when a capture begins."""
     data = lab(tmp_path, "    flicker: {amplitude: 0.4, frequency: 120 Hz, phase: 2.5 rad}\n")

@@ -72,6 +72,7 @@ def run_bare(folder: Path, program: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_the_main_job_needs_nothing_that_only_some_systems_have(tmp_path: Path) -> None:
     """Every module is imported; the dataset is the one that is made here, byte for byte, and no lock stays."""
     pytest.importorskip("filelock")

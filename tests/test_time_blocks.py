@@ -192,6 +192,7 @@ def mapped(tmp_path: Path) -> tuple[ModelPath, Rung]:
     return path, path.ladder[-1]
 
 
+@pytest.mark.slow
 def test_a_map_that_one_capture_tells_is_judged_by_the_other_half_of_it(tmp_path: Path) -> None:
     """Settled to all of it the map leaves nothing of 400 pixels; beside the other half they scatter as they should.
 

@@ -108,11 +108,13 @@ def lay_decoys(watched: Watched, folder: Path, command: list[str] | None = None)
     return marker
 
 
+@pytest.mark.slow
 def test_the_runs_that_are_watched_have_workers_and_ask_for_what_matters(watched: Watched) -> None:
     assert watched.processes >= 2 * (1 + 2)
     assert {"numpy", "numba", "loky", "psutil", "pickle", "h5py", "typing", "__future__"} <= watched.names
 
 
+@pytest.mark.slow
 def test_compare_runs_nothing_of_the_current_folder(watched: Watched, tmp_path: Path) -> None:
     marker = lay_decoys(watched, tmp_path / "here")
     assert "adequate" in run([COMMAND, *watched.compare], tmp_path / "here").stdout
@@ -148,6 +150,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_workers_of_a_script_run_nothing_of_the_current_folder(watched: Watched, tmp_path: Path) -> None:
     script = tmp_path / "elsewhere" / "script.py"
     script.parent.mkdir()
@@ -184,6 +187,7 @@ class Tenth(Effect, stage="correlated"):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [[COMMAND], [sys.executable, "-m", "spadmnist"]])
 def test_a_folder_that_is_named_is_asked_for(command: list[str], tmp_path: Path) -> None:
     """So a plug-in finds what lies beside it, in workers too."""

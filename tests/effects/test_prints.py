@@ -188,6 +188,7 @@ captures:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "name"),
     [
