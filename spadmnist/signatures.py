@@ -3,8 +3,8 @@
 They are computed from three captures of steady light, each many exposures of the same scene, so that the scatter from
 one repetition to the next is known without any model. Where a statistic is a shape, the level is taken out of it.
 
-The statistics of `compare` (`statistics/`) are others: they reduce one recording whose light is inferred from it, so that
-an effect changes most of them.
+The statistics of `compare` (`statistics/`) are others: they reduce one recording whose light is inferred from it, so
+that an effect changes most of them.
 """
 
 from __future__ import annotations
