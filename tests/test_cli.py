@@ -306,6 +306,7 @@ WRONG = {
     "format": (["--format", "tiff"], ["tiff", "zarr", "hdf5"]),
     "plug-in": (["--plugin", "nothing.py"], ["nothing.py"]),
     "option": (["--lmit", "3"], ["--lmit", "--limit"]),
+    "option twice": (["--seed", "1", "--seed=2"], ["--seed", "given 2 times", "give it once"]),
 }
 
 

@@ -160,7 +160,8 @@ def test_arrays_are_the_data() -> None:
     [
         (FLAT, np.zeros((39, 3, 5), np.uint8), r"shape \(39, 3, 5\), not \(frames, rows, columns\), \(40, 3, 5\)"),
         (FLAT, np.full((40, 3, 5), 2), "values other than 0 and 1"),
-        (FLAT, np.zeros((40, 3, 5)), "values other than 0 and 1"),
+        (FLAT, np.full((40, 3, 5), 0.5), "values other than 0 and 1"),
+        (FLAT, np.full((40, 3, 5), np.nan), "values other than 0 and 1"),
         (COUNTS, np.full((4, 3, 5), 4), "no counts of 2 bits, 0 to 3"),
         (COUNTS, np.full((4, 3, 5), -1), "no counts of 2 bits, 0 to 3"),
         (STAMPS, np.zeros(3), r"needs \(times, pixels\)"),
@@ -179,6 +180,25 @@ def test_arrays_that_are_not_what_their_capture_says(capture: Any, data: Any, sa
     with pytest.raises(InputError, match=said) as error:
         sp.Measurement.from_arrays(sensor().layout, {capture: data})
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", [bool, np.int16, np.float32, np.float64])
+def test_binary_frames_of_any_numbers(kind: Any) -> None:
+    bits = np.random.default_rng(1).random((40, 3, 5)) < 0.3
+    one, other = (sp.Measurement.from_arrays(sensor().layout, {FLAT: x})[FLAT.id] for x in (bits, bits.astype(kind)))
+    assert np.array_equal(one.frames, bits) and np.array_equal(other.frames, bits)
+
+
+def test_a_capture_without_light_says_how_a_free_level_is_written() -> None:
+    with pytest.raises(InputError, match="wavelength alone where the level is not known"):
+        sp.Capture("x", "tr", exposure=1.0)
+    assert sp.Capture("x", "tr", exposure=1.0, wavelength=500e-9).light.level is None
+
+
+def test_a_line_of_as_many_pixels_as_the_sensor_is_a_table_without_its_shape() -> None:
+    line = sp.Measurement.from_arrays(sp.Layout(1, 15, 1e-12, 1.0), {STAMPS: ([], [])})
+    with pytest.raises(InputError, match=r"layout has 1 x 15 pixels, .* or import its files again with --rows 3 --col"):
+        line.check_layout(sensor().layout)
 
 
 def test_a_measurement_of_arrays_needs_captures() -> None:

@@ -317,6 +317,21 @@ def test_an_answer_takes_the_place_of_nothing_but_an_answer(tmp_path):
     assert done.exit_code != 0 and data.read_bytes().startswith(b"\x89HDF")
 
 
+def test_the_next_command_of_a_sensor_in_next_names_another_folder(tmp_path: Path, monkeypatch) -> None:
+    """It would take the place of the sensor file, and is refused."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "next").mkdir()
+    text = "sensor:\n  layout: {rows: 2, columns: 2, pixel_area: 25 um^2}\n  effects:\n    dark_counts: {rate: %s}\n"
+    for name, rate in (("s.yaml", "10 kHz"), ("next/sensor.yaml", "90 kHz")):
+        (tmp_path / name).write_text(text % rate)
+    sp.simulate("s.yaml", [sp.Capture("dark", "tr", dark=True, exposure=5e-3)], folder="lab")
+    for name, folder in (("next/sensor.yaml", "next-2"), ("s.yaml", "next")):
+        done = CliRunner().invoke(cli.cli, ["compare", name, "lab", "--jobs", "1"])
+        assert done.exit_code == (1 if folder == "next-2" else 0), done.output
+        assert f"diagnose {name} lab" in done.output
+        assert (f"-o {folder} finds what the model lacks" in done.output) == (folder == "next-2")
+
+
 GATED = sp.effects.ShortGate(fraction=0.9)
 NOISY = sp.effects.SourceNoise(contrast=1.0, coherence_time=1e-3)
 

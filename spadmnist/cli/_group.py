@@ -10,8 +10,25 @@ import click
 from . import _limits as limits
 
 
+class Verb(click.Command):
+    """A verb whose options of one value are given once: of several values the last one would count, in silence."""
+
+    def parse_args(self, context: click.Context, args: list[str]) -> list[str]:
+        _, _, given = self.make_parser(context).parse_args(args=list(args))
+        for option in dict.fromkeys(given):
+            single = isinstance(option, click.Option) and not (option.multiple or option.is_flag or option.count)
+            if single and given.count(option) > 1:
+                name = max(option.opts, key=len)
+                raise click.UsageError(
+                    f"{name} is given {given.count(option)} times, and it takes one value; give it once", context
+                )
+        return super().parse_args(context, args)
+
+
 class Verbs(click.Group):
     """Verbs in the order of a day's work, not of the alphabet."""
+
+    command_class = Verb
 
     def __init__(self, *args: Any, **named: Any):
         super().__init__(*args, **named)

@@ -76,7 +76,8 @@ def compare(
             plugins=plugin_files,
             progress=progress,
         )
-    what = next_step.after_comparison(found, quoted(sensor), options.again(measurement, plugin_files, crop))
+    again = options.again(measurement, plugin_files, crop)
+    what = next_step.after_comparison(found, quoted(sensor), again, _new_folder(sensor))
     with contextlib.ExitStack() as last:  # each is done, the last one first, whatever becomes of the others
         last.callback(lambda: terminal.print_lines(f"{found}\n\nNext: {what}"))
         if output is not None:
@@ -159,7 +160,8 @@ def diagnose(
     if output is not None:
         _write_sensor(found, output / SENSOR)
     new = None if found.file is None else quoted(found.file)
-    same = f"-o {quoted(output or 'next')}{' --quick' if quick else ''}{f' --seed {seed}' if seed else ''}"
+    same = f"-o {quoted(output or Path(_new_folder(sensor)))}{' --quick' if quick else ''}"
+    same += f" --seed {seed}" if seed else ""
     same += f" --max-steps {max_steps}" if max_steps != MAX_STEPS else ""
     again = options.again(measurement, plugin_files, crop)
     what = next_step.after_diagnosis(found.found, quoted(sensor), again, new, same, output is not None)
@@ -230,6 +232,12 @@ def fit(
         last.callback(lambda: _write_answer(json_file, results.canonical(found.found)))
     if found.unwritten:
         sys.exit(2)
+
+
+def _new_folder(sensor: Path) -> str:
+    """The folder that a command to type names for a new sensor: "next", or another one where the sensor lies there."""
+    folder = sensor if sensor.is_dir() else sensor.parent
+    return "next-2" if folder.resolve() == Path("next").resolve() else "next"
 
 
 def _command() -> str:

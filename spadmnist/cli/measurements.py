@@ -12,7 +12,7 @@ import click
 from ..foreign import quoted
 from . import _options as options
 from . import _terminal as terminal
-from ._group import cli
+from ._group import Verb, cli
 
 
 @cli.verb(50, short_help="Show what a dataset or a measurement holds.")
@@ -117,7 +117,7 @@ def simulate(
         terminal.say(f"Look at them:  spadmnist inspect {quoted(output)} --plot {quoted(f'{output.name}.png')}")
 
 
-class _ImportCommand(click.Command):
+class _ImportCommand(Verb):
     """Its options are those of `import_options.Said`, made of that table when they are asked for."""
 
     def get_params(self, context: click.Context) -> list[click.Parameter]:

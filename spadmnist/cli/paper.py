@@ -10,13 +10,13 @@ import click
 from ..system import processors
 from . import _options as options
 from . import _terminal as terminal
-from ._group import cli
+from ._group import Verb, cli
 
 if TYPE_CHECKING:
     from ..experiments import PaperExperiment
 
 
-class _ExperimentCommand(click.Command):
+class _ExperimentCommand(Verb):
     """Beside its own options it has those of the experiment that is named, once it is named."""
 
     def parse_args(self, context: click.Context, args: list[str]) -> list[str]:

@@ -106,10 +106,13 @@ def fit_named(
         null_95 = time_blocks.measure(replicates, path.ladder)
         right = "explained" if wrong else "adequate"
         path.locate()
+        in_sample = comparison_with(replicates, path.sensor_values, path.scan.phases)
+        # the sensor file is judged, too: its pixels may be others than those of the model
+        fails = path.failed or in_sample.verdict == "fails"
         return Diagnosis(
             sensor=replicates.start.name,
             measurement=measurement.name,
-            verdict="partly_explained" if path.failed else right,
+            verdict="partly_explained" if fails else right,
             before=path.ladder[0].misfit,
             after=path.ladder[-1].misfit,
             null_95=null_95,
@@ -126,7 +129,7 @@ def fit_named(
             dark=replicates.dark,
             crop=str(replicates.start.window) if replicates.start.window else None,
             covariance=_covariance(path, exact),
-            in_sample=comparison_with(replicates, path.sensor_values, path.scan.phases),
+            in_sample=in_sample,
             shape=replicates.start.layout.shape,
             asked="fit",
         )

@@ -10,8 +10,13 @@ SENSOR, MEASUREMENT = "SENSOR", "MEASUREMENT"
 _ANOTHER = "a measurement that it was not fitted to tests it"
 
 
-def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str = MEASUREMENT) -> str:
-    """What follows a comparison. sensor, measurement: as the command named them, quoted for a shell."""
+def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str = MEASUREMENT, out: str = "next") -> str:
+    """What follows a comparison.
+
+    Args:
+        sensor, measurement: as the command named them, quoted for a shell.
+        out: the folder of a diagnosis, another one than that of the sensor.
+    """
     if found.verdict == "adequate":
         if found.full:
             return (
@@ -22,7 +27,7 @@ def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str =
             f"spadmnist diagnose {sensor} {measurement} gives a 95 % upper limit on each effect; a brighter, a darker "
             "or a longer capture tests the model further."
         )
-    return f"spadmnist diagnose {sensor} {measurement} -o next finds what the model lacks."
+    return f"spadmnist diagnose {sensor} {measurement} -o {out} finds what the model lacks."
 
 
 def after_diagnosis(

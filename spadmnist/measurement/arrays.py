@@ -151,7 +151,11 @@ def _light(
     if irradiance is not None and lux is not None:
         raise _wrong(id, "has both irradiance and lux; keep one")
     if not given:
-        raise _wrong(id, "says nothing of its light; give dark=True, or wavelength (m) and irradiance (W/m^2)")
+        raise _wrong(
+            id,
+            "says nothing of its light; give dark=True, wavelength (m) and irradiance (W/m^2), or "
+            "wavelength alone where the level is not known",
+        )
     if wavelength is None and lux is None:
         raise _wrong(id, "has an irradiance and no wavelength; give wavelength=500e-9 (m)")
     colour = _LUX_WAVELENGTH if wavelength is None else float(wavelength)
@@ -290,7 +294,7 @@ def _recorded(capture: recordings.Capture, layout: Layout, data: Any) -> Recordi
             "Capture",
         )
     if capture.modality == "qis":
-        if frames.dtype.kind not in "bui" or frames.max() > 1 or frames.min() < 0:
+        if frames.dtype.kind not in "buif" or not np.all((frames == 0) | (frames == 1)):
             raise _wrong(capture.id, "holds values other than 0 and 1; binary frames are 0 or 1")
         return Recording(capture, layout, None, np.packbits(frames.astype(np.uint8), axis=2))
     if capture.modality == "counts":

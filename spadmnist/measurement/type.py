@@ -171,6 +171,8 @@ class Measurement:
                     f"--crop {rows},{columns} (in Python sensor.cropped) if it begins at the first row and column (its "
                     "corner must be put right)"
                 )
+            if mine.rows == 1 and mine.pixels == layout.pixels:
+                part = f", or import its files again with --rows {layout.rows} --columns {layout.columns}"
             raise InputError(
                 f"{self.source}: layout has {_size(mine)} pixels, but the sensor {_size(layout)}; correct one of "
                 f"them{part}"
