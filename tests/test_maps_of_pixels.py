@@ -177,6 +177,36 @@ def placed(raw: np.ndarray, shape: tuple[int, int] | None, noise: float = 0.045)
     return PixelMap(("a", "b"), 1.0, np.arange(raw.size), raw, error, raw, error, 0.5, shape=shape)
 
 
+def test_a_dead_pixel_is_odd_however_little_its_few_counts_say() -> None:
+    """Its own error is as large as its distance, for nearly nothing was counted: the bulk is not as wide as that.
+
+    The estimates of 63 alike pixels scatter by their noise; the upper end of the interval of their width is 0.025.
+    """
+    rng = np.random.default_rng(9)
+    for dead in (1, 2, 4):
+        raw, error = rng.normal(0, 0.03, 64), np.full(64, 0.03)
+        raw[:dead], error[:dead] = -9.0, 2.8
+        map_ = PixelMap(("a", "b"), 1.0, np.arange(64), raw, error, raw, error, 0.5, shape=(8, 8))
+        low, high = odd_pixels(map_)
+        assert np.flatnonzero(low).tolist() == list(range(dead)) and not high.any()
+        found = map_values(map_)
+        assert found["low_fraction"].value == dead / 64
+        assert found["sigma"].value < 0.02 and found["sigma"].high < 0.03
+
+
+@pytest.mark.parametrize("counts", [25, 100, 1000])
+def test_of_alike_pixels_few_are_odd(counts: int) -> None:
+    """Of 200,000 Poisson counts, each side has at most 6e-5 beyond four sigma: 12, or 30 (false alarms: 1e-6)."""
+    n = np.random.default_rng(10).poisson(counts, 200_000)
+    raw, error = np.log(np.maximum(n, 0.5) / counts), 1 / np.sqrt(np.maximum(n, 0.5))
+    map_ = PixelMap(("a", "b"), 1.0, np.arange(n.size), raw, error, raw, error, 0.5)
+    low, _ = odd_pixels(map_)
+    assert low.sum() <= 30
+    # and what is one of a million is
+    raw[0], error[0] = np.log(0.02 if counts == 25 else 0.5), np.sqrt(1 / (counts * (0.02 if counts == 25 else 0.5)))
+    assert odd_pixels(PixelMap(("a", "b"), 1.0, np.arange(n.size), raw, error, raw, error, 0.5))[0][0]
+
+
 @pytest.mark.parametrize("shape", [(1, 256), (256, 1), (32, 32)])
 def test_a_hot_pixel_in_light_that_rises_along_the_array_is_odd(shape: tuple[int, int]) -> None:
     """A pixel is compared with those around it: one of three times their rate is no brighter than the far end.

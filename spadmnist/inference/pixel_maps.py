@@ -138,7 +138,24 @@ class PixelMap:
         width = 1.4826 * float(np.median(np.abs(raw - np.median(raw)))) if raw.size else 0.0
         noise = float(np.median(self.raw_error[known])) if raw.size else NOTHING
         bulk = math.sqrt(max(width**2 - noise**2, 0.0))
-        return np.maximum(times * np.sqrt(bulk**2 + self.raw_error**2), _LEAST_BEYOND)
+        return np.maximum(times * np.sqrt(bulk**2 + self._noise_below(level, noise) ** 2), _LEAST_BEYOND)
+
+    def _noise_below(self, level: np.ndarray, usual: float) -> np.ndarray:
+        """(groups,) the noise of each estimate against a level, so that their distance over it is a normal score.
+
+        The error at the estimate of a dead pixel is as large as its distance: nearly nothing was counted there. At the
+        level it would be small. The signed root of the deviance of a Poisson count says how far below the level it is.
+
+        Args:
+            usual: the error of most pixels, below which it is that of none: others than counts may inform a map.
+        """
+        below = np.minimum(np.nan_to_num(self.estimate - level), 0.0)
+        error = np.minimum(self.raw_error, MOST)
+        ratio = np.exp(below)
+        # expected counts at the level that inform as the estimate's do, and the deviance, as differences of logarithms
+        deviance = 2 * np.maximum(1 - ratio + ratio * below, 0.0) / (error**2 * ratio)
+        noise = np.maximum(-below / np.sqrt(np.maximum(deviance, 1e-30)), usual)
+        return np.where(below < -_LEAST_BEYOND, np.minimum(noise, self.raw_error), self.raw_error)
 
     @property
     def price(self) -> float:
