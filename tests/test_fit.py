@@ -382,6 +382,18 @@ def test_likelihood_and_simulation_agree_on_the_command_line(tmp_path):
         assert one["high"] - one["low"] < 1.1 * (two["high"] - two["low"])
 
 
+def test_a_fit_whose_sensor_file_fails_a_check_is_not_explained(tmp_path, made, monkeypatch):
+    """Its pixels may be others than those of the fitted model, by which no check fails."""
+    sensor, captures, _ = made
+    data = measured(tmp_path, with_values(sensor, {("dead_time", "duration"): 60e-9}), captures)
+    monkeypatch.setattr("spadmnist.inference.named_fit.REPLICATES", 8)
+    found = fit_named(sensor, data, free=["dead_time.duration"], jobs=1)
+    assert found.in_sample.verdict == ("fails" if found.verdict == "partly_explained" else "adequate")
+    failing = replace(found.in_sample, verdict="fails")
+    monkeypatch.setattr("spadmnist.inference.named_fit.comparison_with", lambda *_: failing)
+    assert fit_named(sensor, data, free=["dead_time.duration"], jobs=1).verdict == "partly_explained"
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):

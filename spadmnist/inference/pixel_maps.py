@@ -144,7 +144,7 @@ class PixelMap:
         """(groups,) the noise of each estimate against a level, so that their distance over it is a normal score.
 
         The error at the estimate of a dead pixel is as large as its distance: nearly nothing was counted there. At the
-        level it would be small. The signed root of the deviance of a Poisson count says how far below the level it is.
+        level it would be small. The root of the deviance of a Poisson count says how far below the level it is.
 
         Args:
             usual: the error of most pixels, below which it is that of none: others than counts may inform a map.
