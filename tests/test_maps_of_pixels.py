@@ -17,7 +17,7 @@ from spadmnist.events import Layout
 from spadmnist.inference.candidates import candidates, maps_added, with_values
 from spadmnist.inference.closed_forms import closed_form
 from spadmnist.inference.comparison import compare
-from spadmnist.inference.count_model import light_levels_of
+from spadmnist.inference.count_model import CountModel, light_levels_of
 from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.map_fits import fit_maps
 from spadmnist.inference.named_fit import fit_named
@@ -67,6 +67,36 @@ def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp
     assert abs(np.median(found) / usual - 1) < 5 / np.sqrt(usual * SIDE**2 * FRAMES * 1e-6) + 0.02
     hot = rates > 1000
     assert np.all(np.abs(expected[hot] - counts[hot]) < 0.25 * counts[hot])
+
+
+@pytest.mark.parametrize("frame", ["1 us", "100 us"])
+def test_what_a_hot_pixel_causes_in_its_neighbours_is_not_theirs(frame: str, tmp_path: Path) -> None:
+    """12 or 1200 counts a pixel of its own; a hot pixel causes twice as many in its side neighbours."""
+    (tmp_path / "plan.yaml").write_text(CAPTURES.replace("1 us", frame))
+    (tmp_path / "sensor.yaml").write_text(SENSOR + "    crosstalk: {probability: 0.02, diagonal_ratio: 0.0}\n")
+    sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
+    hot = np.array([85, 153, 256, 314])
+    beside = (hot[:, None] + [-SIDE, -1, 1, SIDE]).ravel()
+    rates = np.full(SIDE * SIDE, 200.0)
+    rates[hot] = 20_000.0 if frame == "1 us" else 2000.0
+    truth = with_values(sensor, {("dark_counts", "rate"): rates})
+    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
+    data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
+    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
+    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
+    map_ = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")]
+    found = map_.values()
+    counts = replicates.seen["dark"].counts
+    assert counts is not None
+    expected = CountModel(replicates, "dark", 1.0).expected(with_values(sensor, {("dark_counts", "rate"): found}))
+    assert abs(expected.sum() / counts.sum() - 1) < (0.05 if frame == "1 us" else 1e-3)
+    # 16 pixels of 12 (1200) counts and as many (a fifth) that are caused
+    share, error = (
+        float(np.mean(found[beside])) / 200,
+        math.sqrt(2 / (12 * 16) if frame == "1 us" else 1.2 / (1200 * 16)),
+    )
+    assert abs(share - 1) < 5 * error
+    assert np.all(np.abs(found[hot] / rates[hot] - 1) < 5 / np.sqrt(counts[hot]) + 0.01)
 
 
 def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:

@@ -85,13 +85,11 @@ class Crosstalk(Effect, stage="correlated"):
             # one list for all pixels: its steps may lead out of the array
             self._first = np.array([0, len(chance)])
             self._steps = step
-            inside = [(layout.columns - abs(dx)) * (layout.rows - abs(dy)) for dx, dy in step.tolist()]
-            self._hits = float(chance @ np.array(inside, float)) / layout.pixels
         else:
             self._first = np.concatenate([[0], np.cumsum(hit)])[near.first]
             home = np.repeat(np.arange(layout.pixels), np.diff(self._first))
             self._steps = np.stack([step - home, 0 * home], axis=1)
-            self._hits = float(chance.sum()) / layout.pixels
+        self._chance = chance
         with np.errstate(divide="ignore"):
             hazard = np.minimum(-np.log1p(-chance), _CERTAIN)
         self._shape = layout.shape
@@ -108,9 +106,23 @@ class Crosstalk(Effect, stage="correlated"):
         return float(self.reach) if self.probability else 0.0
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
-        """rate (1 + probabilities of all neighbours), averaged over the array."""
-        # averaged over the array: a pixel at its edge has fewer neighbours
-        return rate * (1 + self._hits)
+        """rate + sum over the other pixels of chance(their distance) * their rate."""
+        before, after = np.array(rate, order="C"), np.array(rate, order="C")
+        _receive(after, before, self._first, self._chance, self._steps, *self._shape)
+        return after
+
+
+@kernels.jit
+def _receive(after, rate, first, chance, steps, rows, columns):  # type: ignore[no-untyped-def]
+    """Add to each pixel what its neighbours' rates (images, pixels) fire there; the lists are those of `_hits`."""
+    for i in range(rate.shape[0]):
+        for pixel in range(rows * columns):
+            entry = 0 if first.size == 2 else pixel
+            for k in range(first[entry], first[entry + 1]):
+                x = pixel % columns + steps[k, 0]
+                y = pixel // columns + steps[k, 1]
+                if 0 <= x < columns and 0 <= y < rows:
+                    after[i, y * columns + x] += chance[k] * rate[i, pixel]
 
 
 @kernels.jit

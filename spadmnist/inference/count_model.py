@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -42,6 +43,11 @@ class CountModel:
             return np.maximum(pixel_counts(sensor, self.seen.capture)(self.level), 1e-9)
         events = events_in_frames(sensor, np.full((1, sensor.layout.pixels), self.level), self.conditions)[0]
         return np.asarray(np.maximum(self.waited * events, 1e-9))
+
+    def alone(self, sensor: Sensor) -> np.ndarray:
+        """The expected detections of each pixel without those that other pixels cause, (pixels,)."""
+        own = [e for e in sensor.effects if not 0 < e.influence() < math.inf]
+        return self.expected(sensor if len(own) == len(sensor.effects) else sensor.changed(effects=own))
 
     def log_likelihood(self, expected: np.ndarray) -> np.ndarray:
         """The log-likelihood of the measured counts, (pixels,), up to a constant.

@@ -102,6 +102,7 @@ class _Fitted:
         sigma: width of the prior.
         precision: (groups,) of the prior: smaller for odd pixels.
         shape: (rows, columns) of a map of pixels.
+        moved: (groups,) the last step of the estimates.
     """
 
     candidate: Candidate
@@ -115,6 +116,7 @@ class _Fitted:
     raw: np.ndarray
     raw_variance: np.ndarray
     precision: np.ndarray
+    moved: np.ndarray
     shape: tuple[int, int] | None
     middle: float = 0.0
     sigma: float = _FIRST_WIDTH
@@ -139,6 +141,7 @@ class _Fitted:
             raw=np.zeros(size),
             raw_variance=np.zeros(size),
             precision=np.full(size, _FIRST_PRECISION),
+            moved=np.zeros(size),
             shape=shape_of(start, candidate.per),
         )
 
@@ -152,7 +155,9 @@ class _Fitted:
 
     def move(self, by: np.ndarray) -> None:
         """Move the estimates, by a step that is not too large."""
-        self.logs = np.clip(self.logs + np.clip(by, -_LARGEST_STEP, _LARGEST_STEP), -MOST, MOST)
+        before = self.logs
+        self.logs = np.clip(before + np.clip(by, -_LARGEST_STEP, _LARGEST_STEP), -MOST, MOST)
+        self.moved = self.logs - before
 
     def move_alone(self, normal: np.ndarray, score: np.ndarray) -> None:
         """A Newton step of this map, with the others as they are.
@@ -167,19 +172,20 @@ class _Fitted:
         own = np.maximum(information, 1e-12)
         self.raw, self.raw_variance = self.logs + gradient / own, 1 / own
 
-    def renew_prior(self, normal: np.ndarray, score: np.ndarray) -> None:
+    def renew_prior(self, normal: np.ndarray, score: np.ndarray, left: np.ndarray) -> None:
         """Middle and width of the prior from the pixels' differences beyond their noise, robust against odd pixels.
 
         Args:
             normal: (pixels,) information of the counts.
-            score: (pixels,) derivatives of their log-likelihood.
+            score: (pixels,) derivatives of their log-likelihood before the last step.
+            left: (pixels,) the derivatives behind it, by the linear model.
         """
         weight = (TAILS + 1) / (TAILS + (self.logs - self.middle) ** 2 / self.sigma**2)
         if self.of_light:
             self.logs = self.logs - math.log(float(np.mean(np.exp(self.logs))))
         else:  # the mean of all pixels, which no pixel by itself may inform
-            own, left = self.sums(normal, weight), self.sums(score, weight)
-            shift = float(np.clip(left.sum() / max(float(own.sum()), 1e-12), -_LARGEST_SHIFT, _LARGEST_SHIFT))
+            own, rest = self.sums(normal, weight), self.sums(left, weight)
+            shift = float(np.clip(rest.sum() / max(float(own.sum()), 1e-12), -_LARGEST_SHIFT, _LARGEST_SHIFT))
             self.logs = self.logs + shift
             self.middle = float(np.average(self.logs, weights=weight))
         square = float(np.mean(weight * (self.logs - median_of(self.logs)) ** 2 + self.variance))
@@ -316,9 +322,11 @@ def fit_maps(
         for i, one in enumerate(fitted):
             if not together:
                 one.move_alone(normal[:, i, i], score[:, i])
-        for i, one in enumerate(fitted):
-            if turn >= _FREE_TURNS:
-                one.renew_prior(normal[:, i, i], score[:, i])
+        if turn >= _FREE_TURNS:
+            moved = np.stack([one.moved[one.group] for one in fitted], axis=1)
+            left = score - (normal @ moved[:, :, None])[:, :, 0]
+            for i, one in enumerate(fitted):
+                one.renew_prior(normal[:, i, i], score[:, i], left[:, i])
     scene = any(replicates.of_scene(line.id) for line in lines)
     for i, one in enumerate(fitted):
         assert one.candidate.carrier is not None
@@ -328,7 +336,7 @@ def fit_maps(
             def at(log: float, i: int = i) -> Sensor:
                 return model([np.full(o.logs.size, log) if j == i else o.logs for j, o in enumerate(fitted)])
 
-            map_ = _of_few_counts(map_, lines, at)
+            map_ = _of_few_counts(map_, lines, at, model([o.logs for o in fitted]))
         out[one.candidate.carrier] = map_
     return out
 
@@ -359,7 +367,8 @@ def _normal_equations(
         scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()
         # until the level is that of these maps, and no factor is needed
         line.level *= min(max(scale, 1 / _LEVEL_STEP), _LEVEL_STEP)
-        jacobian = np.stack([(line.expected(o) - expected) / _DIFFERENCE for o in other], axis=1) * scale
+        alone = line.alone(now)  # of a pixel's own value: what its neighbours cause there is that of their values
+        jacobian = np.stack([(line.alone(o) - alone) / _DIFFERENCE for o in other], axis=1) * scale
         expected = expected * scale
         variance = line.variance(np.maximum(expected, 0.5), dead)
         normal += jacobian[:, :, None] * jacobian[:, None, :] / variance[:, None, None]
@@ -393,18 +402,26 @@ def _move_together(fitted: Sequence[_Fitted], normal: np.ndarray, score: np.ndar
         one.variance = inverse[:, i, i]
 
 
-def _of_few_counts(map_: PixelMap, lines: Sequence[CountModel], model: Callable[[float], Sensor]) -> PixelMap:
+def _of_few_counts(
+    map_: PixelMap, lines: Sequence[CountModel], model: Callable[[float], Sensor], fitted: Sensor
+) -> PixelMap:
     """The map of pixels with few counts, with a nonparametric prior that all of them inform together.
 
     Args:
         lines: the count model of each capture.
         model: log value of all pixels -> sensor.
+        fitted: the sensor with the map so far, by which neighbours cause counts.
     """
+    received = [line.expected(fitted) - line.alone(fitted) for line in lines]
     centre, size = float(np.median(map_.estimate)), map_.estimate.size
     grid = centre + np.linspace(*GRID)
     logs = np.stack(
         [
-            np.bincount(map_.group, sum(line.log_likelihood(line.expected(sensor)) for line in lines), size)
+            np.bincount(
+                map_.group,
+                sum(line.log_likelihood(line.alone(sensor) + more) for line, more in zip(lines, received, strict=True)),
+                size,
+            )
             for sensor in map(model, grid.tolist())
         ],
         axis=1,
@@ -448,7 +465,7 @@ def _begun(
         for line in lines:
             counts, expected = line.seen.counts, line.expected(now)
             assert counts is not None
-            slope = (line.expected(other) - expected) / step
+            slope = (line.alone(other) - line.alone(now)) / step
             informative = float((slope**2 / line.variance(np.maximum(expected, 0.5), 0.0)).sum())
             if informative > most and not line.saturated(counts):
                 scale = 1.0 if line.seen.capture.light.dark else counts.sum() / expected.sum()

@@ -63,9 +63,8 @@ def information(
             out[id] = np.zeros(pixels)
             continue
         line = CountModel(replicates, id, levels[id])
-        a, b = line.expected(start), line.expected(other)
-        slope = (b - a) / 0.02
-        out[id] = slope**2 / line.variance(np.maximum(a, 0.5), replicates.dead)
+        slope = (line.alone(other) - line.alone(start)) / 0.02
+        out[id] = slope**2 / line.variance(np.maximum(line.expected(start), 0.5), replicates.dead)
     return out
 
 

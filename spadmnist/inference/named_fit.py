@@ -97,7 +97,9 @@ def fit_named(
         try:
             wanted, exact = _maximum_likelihood(measurement, replicates, wanted)
         except NoLikelihood as error:  # it holds the recordings, whose memory the replicates need
-            say(f"by simulation, for there is no likelihood of {error}")
+            ways = sorted({_method(candidate) for candidate in wanted})
+            misfit = "" if ways == ["simulation"] else ", the misfit by simulation"
+            say(f"by {' and '.join(ways)}{misfit}, for there is no likelihood of {error}")
         if exact is None:
             _by_simulation(path, wanted)
         else:
@@ -290,10 +292,14 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
                 )
             if key in ends and key in step.intervals and value.low is not None and value.high is not None:
                 low, high = min(ends[key][0], value.low), max(ends[key][1], value.high)  # over all whole numbers
-            how = "simulation"
-            if step.candidate.carrier:
-                how = step.candidate.informed_by or ("intervals" if step.candidate.blinds else "counts")
-            step.values[name] = replace(value, low=low, high=high, method=how)
+            step.values[name] = replace(value, low=low, high=high, method=_method(step.candidate))
+
+
+def _method(candidate: Candidate) -> str:
+    """What a fit without a likelihood is by: simulation, or of a map what informs each pixel."""
+    if not candidate.carrier:
+        return "simulation"
+    return candidate.informed_by or ("intervals" if candidate.blinds else "counts")
 
 
 def _widened(coordinate: Coordinate, value: float, ends: tuple[float, float], variance: float) -> tuple[float, float]:

@@ -380,6 +380,28 @@ def test_mean_of_crosstalk_and_its_cascades(rules: str) -> None:
     assert effect.expected_rate(np.full((1, 24), 1e3), exposure_of(1.0)).sum() == pytest.approx(once.sum() * 100)
 
 
+def test_the_closed_form_of_crosstalk_says_which_pixel_it_comes_from() -> None:
+    """The chances of all pairs, on a grid and of the same pixels as a list; the recorded means of a hot pixel's row."""
+    grid = Layout(4, 6, 1.0, 1.0)
+    listed = Layout(1, 24, 1.0, 1.0, positions=grid.places)
+    rate = np.full((1, 24), 1e3)
+    rate[0, 8] = 1e5
+    distance = np.hypot(*(grid.places[:, None] - grid.places[None]).transpose(2, 0, 1))
+    for layout in (grid, listed):
+        effect = crosstalk_of(layout, probability=0.06, diagonal_ratio=0.5)
+        chance = np.where((distance > 0) & (distance < 1.5), effect.chance(np.maximum(distance, 1)), 0.0)
+        expected = effect.expected_rate(rate, exposure_of(1.0))
+        assert expected == pytest.approx(rate + rate @ chance)
+    recorded = exposed(
+        grid, rate[0], [Crosstalk(probability=0.06, diagonal_ratio=0.5)], exposure_of(0.01), 3000, "paper"
+    )
+    n = counts(recorded).reshape(-1, 24)
+    for pixel in range(6, 12):
+        laws.mean_is(n[:, pixel], 0.01 * float(expected[0, pixel]), SHARED, f"pixel {pixel}")
+    with fails():  # as if every pixel had the mean of the array
+        laws.mean_is(n[:, 7], 0.01 * 1e3 * float(expected.sum() / rate.sum()), SHARED, "pixel 7")
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("rules", ["paper", "device"])
 def test_first_stamps_after_a_frame_that_fired_late(share: float, rules: str) -> None:
