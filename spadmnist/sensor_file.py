@@ -247,8 +247,8 @@ def write(
 
 def _number(declared: Parameter, value: float) -> str | float:
     if declared.unit:
-        return units.show(float(value), declared.unit, 6)
-    rounded = float(f"{float(value):.6g}")
+        return units.show(float(value), declared.unit, units.WRITTEN)
+    rounded = units.rounded(float(value))
     return int(rounded) if rounded.is_integer() and abs(rounded) < 1e6 else rounded
 
 

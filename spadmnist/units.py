@@ -55,6 +55,8 @@ _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(\
 _MICRO = re.compile("(?<![A-Za-z])[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}](?=[A-Za-z])")
 
 _LONGEST = 60  # characters of a quantity
+# digits of a fitted number in a sensor file: a hundred times finer than the smallest error of a fit; a rule of thumb
+WRITTEN = 6
 
 # SI units: what a time or a level that a file declares may be; beyond it the number is damaged
 SHORTEST, LONGEST = 1e-18, 1e18
@@ -193,6 +195,11 @@ def show(value: float, unit: str, digits: int = 4) -> str:
     rounded = float(f"{number:.{digits}g}")
     plain = 10**digits <= abs(rounded) < 1e7  # `36000 s` and not 3.6e+04
     return f"{rounded:.0f} {best[0]}" if plain else f"{number:.{digits}g} {best[0]}"
+
+
+def rounded(value: float) -> float:
+    """A value in SI as a file that we write has it, with `WRITTEN` digits."""
+    return float(f"{value:.{WRITTEN}g}")
 
 
 def exact(value: float, unit: str) -> str:

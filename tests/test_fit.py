@@ -394,6 +394,19 @@ def test_a_fit_whose_sensor_file_fails_a_check_is_not_explained(tmp_path, made, 
     assert fit_named(sensor, data, free=["dead_time.duration"], jobs=1).verdict == "partly_explained"
 
 
+def test_a_fit_and_a_comparison_of_its_file_have_one_misfit(tmp_path, lab):
+    """The file has six digits of a value; the statistics are those that go with its dead time."""
+    sensor, data = lab(dead=56, seed=3)
+    found = sp.fit(sensor, data, free=["dead_time.duration"], jobs=1)
+    found.save(tmp_path / "next")
+    written = sp.read_sensor(tmp_path / "next" / "sensor.yaml")
+    assert written.effect("dead_time").duration == found.model.effect("dead_time").duration
+    compared = sp.compare(written, data, jobs=1)
+    assert found.misfit_in_sample == compared.misfit
+    ours, theirs = ({(c.capture, c.statistic): c.p for c in one.checks} for one in (found.found.in_sample, compared))
+    assert ours == theirs
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_switch_that_is_as_it_should_be_stays(tmp_path, made, monkeypatch):

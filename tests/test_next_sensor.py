@@ -17,6 +17,7 @@ from spadmnist import cli, measurement, sensor_file
 from spadmnist.errors import InputError
 from spadmnist.inference import model_selection, results
 from spadmnist.inference.candidates import Candidate
+from spadmnist.inference.next_step import after_diagnosis
 from spadmnist.inference.results import Step, Value
 from spadmnist.pages import diagnosis as page_of
 
@@ -248,6 +249,29 @@ def test_the_set_up_or_the_sensor_are_both_named() -> None:
     assert said == "the light of bright, or short_gate: each explains the totals, and the sensor file has neither."
     found.steps = [step("add", "crosstalk"), *found.steps]
     assert results.sentence(found).endswith("the sensor file has neither; besides, crosstalk was found.")
+
+
+def test_a_tie_with_the_set_up_says_what_to_measure_and_how_to_take_the_sensor() -> None:
+    """The new file does not have the tie: to compare it would say nothing."""
+    found = answer({}, "confused", or_setup=True)
+    factor = {"value": 0.95, "low": 0.94, "high": 0.96}
+    found.setup = [
+        {"capture": id, "quantity": name, "factor": factor, "confused": True}
+        for id in ("dim", "bright")
+        for name in ("light", "exposure")
+    ]
+    found.steps = [step("add", "short_gate")]
+    said = after_diagnosis(found, "s.yaml", "lab")
+    assert said.startswith("measure the light or exposure of dim and bright again and correct measurement.yaml; if it ")
+    assert "spadmnist fit s.yaml lab --add short_gate -o NEXT" in said
+    found.steps = [step("add", "crosstalk"), step("set", "dead_time", "duration")]
+    assert "spadmnist fit next/sensor.yaml lab --free dead_time.duration" in after_diagnosis(found, "s.yaml", "lab")
+    words = {"capture": "a flat field ten times as bright as dim", "separates": ["light", "short_gate"]}
+    found.advice = [words | {"significance_now": 0.1, "significance_then": 9.0}]
+    said = after_diagnosis(found, "s.yaml", "lab")
+    assert said == "take a flat field ten times as bright as dim, add it to the measurement, and diagnose again."
+    found.verdict, found.or_setup, found.steps = "setup", False, []
+    assert after_diagnosis(found).startswith("measure the light or exposure of dim and bright again, correct")
 
 
 def test_a_search_that_ended_at_its_largest_number_of_steps_says_so(

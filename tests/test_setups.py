@@ -190,6 +190,8 @@ def test_background_light_beside_one_wrong_level_is_a_tie_with_two_wrong_levels(
     found = diagnose(*with_background(tmp_path), quick=True, jobs=1)
     assert found.verdict == "confused"
     assert [step.candidate.name for step in found.steps] == ["add background_light"]
+    assert [other["what"] for other in found.steps[0].alternatives] == ["the set-up of low and high"]
+    assert "the sensor file does not have it" in found.steps[0].material
     value = found.steps[0].values["rate"]
     assert value.value == pytest.approx(300, rel=0.5)
     assert {e["capture"] for e in found.setup} == {"low", "high"} and all(e["confused"] for e in found.setup)

@@ -44,7 +44,8 @@ MEANINGS = {
     "misfit.before": "misfit of the sensor that was given",
     "misfit.after": "misfit of the model that was found, each capture judged by parameters fitted without it",
     "compared": "what alone was compared with the model, where that is not every statistic",
-    "misfit_in_sample": "misfit with all captures in the fit; null: not measured",
+    "misfit_in_sample": "misfit with all captures in the fit, which `compare` has of the next "
+    "sensor file (`--quick`: from 32 simulations in place of 96); null: not measured",
     "misfit_null_95": "95 % quantile of the misfit of a right model",
     "false_alarm_rate": "probability that a right model is called wrong",
     "replicates": "simulations of each capture",

@@ -12,7 +12,7 @@ import itertools
 import json
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,12 +28,11 @@ from ..statistics import Summary
 from ..workers import Executor, executor
 from .candidates import with_values
 from .captures_together import Together, checks_together
-from .coordinates import Key, Values
+from .coordinates import Values
 from .deviations import LISTED, Deviation, deviations, excess, listed
-from .evaluation import Evaluation, evaluate, mean_misfit, misfit_null_95, misfits
+from .evaluation import Evaluation, mean_misfit, misfit_null_95, misfits
 from .levels import FALSE_ALARM, HALF_95, LEAST_P, SHARE_OF_STATISTICS, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
-from .models import Model
 from .null_distribution import Judgement
 from .phases import evaluate_start
 from .replicates import REPLICATES, TOTALS, Cell, Execution, Replicates
@@ -219,17 +218,17 @@ def compare(
         return comparison_of(simulations, evaluation, tolerance)
 
 
-def comparison_with(
-    replicates: Replicates, values: Values, phases: Mapping[tuple[str, Key], float] | None = None
-) -> Comparison:
-    """The comparison of the sensor with these parameters, as the next sensor file has them: in sample.
+def comparison_with(replicates: Replicates, values: Values) -> Comparison:
+    """The comparison of the sensor with these parameters, as `compare` compares the next sensor file: in sample.
 
     Args:
+        replicates: of the stated model; `compare` has as many of each capture unless the search is a quick one.
         values: by (effect, parameter), SI.
-        phases: by (capture, parameter), rad.
     """
-    sensors = Model.same(with_values(replicates.start, values)).changed({}, phases)
-    return comparison_of(replicates, evaluate(replicates, values, sensors, remember=not phases))
+    own = replicates.of_model(with_values(replicates.start, values))
+    evaluation, _ = evaluate_start(own)
+    replicates.simulations += own.simulations
+    return comparison_of(own, evaluation)
 
 
 def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: float | None = None) -> Comparison:

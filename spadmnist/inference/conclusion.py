@@ -191,8 +191,12 @@ def too_short(short: Mapping[str, tuple[float, float]]) -> list[dict[str, Any]]:
     return out
 
 
-def rival_step(path: ModelPath, rival: Trial) -> Step:
-    """A change of the sensor that explains the totals as well as the set-up does, as a step."""
+def rival_step(path: ModelPath, rival: Trial, faulty: str) -> Step:
+    """A change of the sensor that explains the totals as well as the set-up does, as a step; it is in no sensor file.
+
+    Args:
+        faulty: in words, the captures of which the set-up explains them.
+    """
     coordinate = rival.candidate.strengths[0]
     low, high = rival.intervals.get(coordinate.key, (None, None))
     value = Value(value=float(rival.values[coordinate.key]), low=low, high=high, unit=coordinate.unit)
@@ -202,10 +206,16 @@ def rival_step(path: ModelPath, rival: Trial) -> Step:
         values={coordinate.parameter: value},
         misfit=left,
         significance=math.sqrt(max(rival.fall, 0.0)),
-        material="all rates alike",
+        material="all rates alike; the sensor file does not have it",
+        alternatives=[_outside(f"the set-up of {faulty}", left)],
     )
 
 
 def outside(mimic: Mimic, misfit: float) -> dict[str, Any]:
     """A mimic as an alternative."""
-    return {"change": "unknown", "effect": None, "parameter": None, "misfit": plain(misfit), "what": mimic.what}
+    return _outside(mimic.what, misfit)
+
+
+def _outside(what: str, misfit: float) -> dict[str, Any]:
+    """What no effect describes, as an alternative."""
+    return {"change": "unknown", "effect": None, "parameter": None, "misfit": plain(misfit), "what": what}

@@ -25,6 +25,7 @@ from .candidates import Candidate, with_values
 from .closed_forms import CLOSED, closed_form, error_by_causes, level_for
 from .laws import poisson_scores
 from .levels import LEAST_P
+from .model_path import change_by_map
 from .pixel_maps import map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title
@@ -155,7 +156,7 @@ def _judge(replicates: Replicates, ids: Sequence[str], sensor: Sensor, errors: n
         wider = (float(own.sum()) + known + unsure * mean_total**2) / max(mean_total, 1e-300)
         score = float(poisson_scores(np.array([total]), np.array([mean_total]))[0])
         scores.append(score / math.sqrt(max(wider, 1.0)))
-        totals.append(abs(math.log(max(total, 0.5) / mean_total)) if abs(score) > 1 else 0.0)
+        totals.append(abs(max(total, 0.5) / mean_total - 1) if abs(score) > 1 else 0.0)
         excess.append(math.sqrt(max(float(np.mean(apart**2 - own)), 0.0)) / max(float(expected.mean()), 1e-12))
     mean = max(float(np.mean(means)), _LEAST_MEAN)
     spread = float(np.mean(variances)) / np.size(variances) / mean**2
@@ -192,14 +193,13 @@ def _answer(
         where = "pixels of one half of the blocks of time, by a map of the other"
         rest.append({"statistic": "pixel_map", "capture": dark[0], "significance": clear, "where": where})
     right = "explained" if start.p_value() < _SURE else "adequate"
-    mean = float(np.mean(map_.values())) / max(float(np.mean(_listed(replicates.start, candidate))), 1e-300)
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
     step = Step(
         candidate=candidate,
         values=results,
         misfit=found.misfit,
         significance=start.significance(),
-        material=f"mean of the map {100 * (mean - 1):+.2f} %",
+        material=change_by_map(replicates.start, map_),
     )
     step.map = map_
     return Diagnosis(
@@ -223,9 +223,3 @@ def _answer(
         crop=str(replicates.start.window) if replicates.start.window else None,
         compared="the counts in the dark",
     )
-
-
-def _listed(sensor: Sensor, candidate: Candidate) -> np.ndarray:
-    assert candidate.carrier is not None
-    effect = sensor.effect(candidate.carrier[0])
-    return np.asarray(getattr(effect, candidate.carrier[1], 0.0), float)

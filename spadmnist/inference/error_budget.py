@@ -22,6 +22,8 @@ from .results import Step, plain, title
 from .signature import Signature, residuals_at
 from .trial import Phases, Trial
 
+_MOST = 50.0  # of a logarithm, at most: a larger ratio says no more, and would overflow; a rule of thumb
+
 
 @dataclass(frozen=True)
 class HeldMaps:
@@ -72,9 +74,10 @@ def physical_errors(
 ) -> dict[str, float]:
     """The physical errors of a model, relative, by name; of what was not measured there is none.
 
-    The light's uncertainty and the noise are no errors of the model. mean_rate: rms error of the captures' rates,
-    beyond that of their noise. linearity: the largest deviation of a lit capture from the median of the other ones, its
-    noise included. The others are those of statistics (`Statistic.physical_error`), in the mean over the captures.
+    The light's uncertainty and the noise are no errors of the model. mean_rate: rms of the captures' rates relative to
+    those of the model, less 1, beyond that of their noise. linearity: the largest deviation of a lit capture from the
+    median of the other ones, its noise included. The others are those of statistics (`Statistic.physical_error`), in
+    the mean over the captures.
 
     Args:
         residuals: (cells,) by block.
@@ -98,9 +101,9 @@ def physical_errors(
             weight = 1 / noise[lit] ** 2
             light = float(weight @ x[lit]) / float(weight.sum() + 1 / width**2)
             x = x - light * lit
-        errors["mean_rate"] = rms_beyond_noise(x * elasticities, noise * elasticities)
+        errors["mean_rate"] = rms_beyond_noise(relative(x * elasticities), noise * elasticities)
         if lit.sum() > 1:
-            errors["linearity"] = float(np.max(np.abs(from_the_others(x[lit])) * elasticities[lit]))
+            errors["linearity"] = float(np.max(np.abs(relative(from_the_others(x[lit]) * elasticities[lit]))))
     shares: dict[str, list[float]] = {}
     for cell, z in residuals.items():
         if cell == TOTALS or not (statistic := Statistic.registry.find(cell[1])).error:
@@ -119,6 +122,11 @@ def physical_errors(
         shares.setdefault(statistic.error, []).append(error)
     whole = errors | {k: float(np.mean(v)) for k, v in shares.items()}
     return {k: plain(v) for k, v in whole.items()}
+
+
+def relative(logs: np.ndarray) -> np.ndarray:
+    """A deviation measured / expected - 1 of its logarithm."""
+    return np.expm1(np.clip(logs, -_MOST, _MOST))
 
 
 def rms_beyond_noise(deviations: np.ndarray, noise: np.ndarray) -> float:

@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ..effects import ByWavelength
 from ..errors import SpadError
+from ..sensor import Sensor
+from ..units import rounded
 from . import count_model, held_out, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .coordinates import Coordinate, Key
@@ -168,16 +171,17 @@ class ModelPath:
 
     @property
     def sensor_values(self) -> dict[Key, Any]:
-        """The values of one sensor that stands for the model, SI; its pixels are those of the chip.
+        """The values of one sensor that stands for the model, SI, as its file has them; its pixels are the chip's.
 
-        A map has the spread of the chip, and what hits pixels at random is in those that it has hit.
+        Numbers are rounded as in the file. A map has the spread of the chip, and what hits pixels at random is in
+        those that it has hit.
         """
         maps = {step.candidate.carrier: step.map for step in self.steps if step.candidate.carrier and step.map}
         values = {**self.values, **{key: map_.spread_values() for key, map_ in maps.items() if key in self.values}}
         for step in self.steps:
             found = self.pixels_hit(step)
             values |= {} if found is None else found.values
-        return values
+        return {key: _as_written(x) for key, x in values.items()}
 
     def locate(self) -> None:
         """Write into each step the pixels that its effect has hit."""
@@ -218,6 +222,13 @@ class ModelPath:
         """Replace the last row of the error budget by the model as it is now."""
         last = self.ladder.pop()
         self.rung(last.model, last.steps)
+
+
+def _as_written(value: Any) -> Any:
+    """A value as a sensor file has it; maps are written as they are."""
+    if isinstance(value, ByWavelength):
+        return ByWavelength(value.wavelengths, tuple(map(rounded, value.values)))
+    return rounded(value) if isinstance(value, float) else value
 
 
 def begin(replicates: Replicates) -> ModelPath:
@@ -274,6 +285,9 @@ def accept(path: ModelPath, best: Trial, significance: float) -> list[Step]:
     # all is fitted again once no check fails plainly: until then the columns of the separate fits are good enough
     columns = [] if best.chips or best.fluctuates else [fit for fit in (path.fit, best.fit) if fit is not None]
     fit_all(path, best.fit, known, columns, roughly, near, where_shown=True)
+    for step in new:
+        if step.map is not None:
+            step.material = change_by_map(replicates.start, step.map)
     path.rung("+ " + " + ".join(title(step.candidate) for step in new), new)
     return new
 
@@ -306,6 +320,15 @@ def material(one: Trial) -> str:
     """The change of the mean rate by a candidate, as text."""
     logs = list(one.signature.at(one.times).logs.values())
     return f"mean rate {100 * math.expm1(-float(np.mean(logs)) if logs else 0.0):+.2f} %"
+
+
+def change_by_map(sensor: Sensor, map_: pixel_maps.PixelMap) -> str:
+    """The change of the mean of a parameter by its map, as text."""
+    effect = sensor.effect(map_.carrier[0])
+    listed = float(np.mean(np.asarray(getattr(effect, map_.carrier[1], 0.0), float)))
+    if listed <= 0:
+        return "a map where there was none"
+    return f"mean of the map {100 * (float(np.mean(map_.values())) / listed - 1):+.2f} %"
 
 
 def keys_of(candidate: Candidate, path: ModelPath) -> set[Key]:

@@ -172,7 +172,7 @@ def _diagnosed(
         replicates.budget.until = 1.0
         verdict = or_confused(path, notes, verdict)
     if notes.rival is not None:
-        path.steps.append(rival_step(path, notes.rival))
+        path.steps.append(rival_step(path, notes.rival, notes.faulty))
     for step in path.steps:
         for other in step.alternatives:
             other.pop("confused", None)
@@ -191,9 +191,7 @@ def _diagnosed(
     with or_as_before(path, "the last comparison"):
         replicates.say("the comparison of the model with its steps")
         own = None if path.steps else start
-        in_sample = (
-            comparison_of(replicates, own) if own else comparison_with(replicates, path.sensor_values, path.scan.phases)
-        )
+        in_sample = comparison_of(replicates, own) if own else comparison_with(replicates, path.sensor_values)
     last = LastLook(rungs=rungs, null_95=null_95, limits=limits, in_sample=in_sample)
     found = answer(path, start, notes, verdict, last)
     found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None

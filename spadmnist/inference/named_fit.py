@@ -108,7 +108,7 @@ def fit_named(
         null_95 = time_blocks.measure(replicates, path.ladder)
         right = "explained" if wrong else "adequate"
         path.locate()
-        in_sample = comparison_with(replicates, path.sensor_values, path.scan.phases)
+        in_sample = comparison_with(replicates, path.sensor_values)
         # the sensor file is judged, too: its pixels may be others than those of the model
         fails = path.failed or in_sample.verdict == "fails"
         return Diagnosis(

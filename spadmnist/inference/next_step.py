@@ -53,6 +53,16 @@ def after_diagnosis(
         return f"spadmnist compare {new} {measurement} checks the fitted model; {_ANOTHER}."
     if found.verdict == "adequate":
         return "nothing is missing; a brighter, a darker or a longer capture tests the model further."
+    if found.advice and found.verdict == "confused":
+        return f"take {found.advice[-1]['capture']}, add it to the measurement, and diagnose again."
+    if found.or_setup:
+        last = found.steps[-1]
+        start = new if len(found.steps) > 1 and new else sensor  # the file has the steps before it
+        option = f"--add {last.effect}" if last.change == "add" else f"--free {last.effect}.{last.parameter}"
+        return (
+            f"measure {_stated(found)} again and correct measurement.yaml; if it is as stated, spadmnist fit {start} "
+            f"{measurement} {option} -o NEXT puts {last.effect} into the model."
+        )
     if new is None and found.steps and found.verdict in ("explained", "partly_explained", "confused"):
         return f"spadmnist diagnose {sensor} {measurement} {same} writes the new model, for compare to check."
     if found.verdict == "explained" and found.faulty:
@@ -61,14 +71,11 @@ def after_diagnosis(
             f"{measurement}."
         )
     if found.verdict == "setup" and found.setup:
-        entry = found.setup[0]
         return (
-            f"measure the {entry['quantity']} of {entry['capture'] or 'all captures'} again, correct measurement.yaml, "
+            f"measure {_stated(found)} again, correct measurement.yaml, "
             f"and type spadmnist diagnose {sensor} {measurement} {same}: faint effects, which fail no check, are "
             "looked for where the totals agree."
         )
-    if found.advice and found.verdict == "confused":
-        return f"take the capture {found.advice[-1]['capture']!r}, add it to the measurement, and diagnose again."
     if found.verdict == "unexplained":
         near = nearest(found)
         like = f", perhaps like {near[0]}" if near else ""
@@ -84,3 +91,14 @@ def after_diagnosis(
             "of an effect for it."
         )
     return f"spadmnist compare {new} {measurement} checks the new model; {_ANOTHER}."
+
+
+def _stated(found: Diagnosis) -> str:
+    """What of the set-up is to be measured again, in words: the quantities of each capture."""
+    quantities: dict[str, list[str]] = {}
+    for entry in found.setup:
+        quantities.setdefault(entry["capture"] or "all captures", []).append(entry["quantity"])
+    captures: dict[str, list[str]] = {}
+    for capture, names in quantities.items():
+        captures.setdefault(" or ".join(dict.fromkeys(names)), []).append(capture)
+    return ", and ".join(f"the {names} of {' and '.join(of)}" for names, of in captures.items())

@@ -194,6 +194,18 @@ class Replicates:
         conditions = replace(recording.conditions, exposure=self.exposures[id])
         return replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
 
+    def of_model(self, sensor: Sensor) -> Replicates:
+        """The measurement for another model, reduced as a comparison with that one reduces it."""
+        own = sensor.resolved()
+        if (own.nominal_dead_time, own.tick) == (self.dead, self.start.tick):  # what the reduction takes of a sensor
+            other = copy.copy(self)
+            other.start, other.simulations = own, 0
+            return other
+        by = Execution(
+            workers=self.workers, say=self.say, progress=self.progress, budget=self.budget, journal=self.journal
+        )
+        return Replicates(sensor, self.measurement, self.seed, by, self.number, self.exposures, self.reduced)
+
     def candidates(self, sensor: Sensor) -> list[Candidate]:
         """Every candidate of a sensor that these captures can show."""
         captures = (seen.capture for seen in self.seen.values())
