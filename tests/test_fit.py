@@ -403,7 +403,7 @@ def test_a_fit_and_a_comparison_of_its_file_have_one_misfit(tmp_path, lab):
     assert written.effect("dead_time").duration == found.model.effect("dead_time").duration
     compared = sp.compare(written, data, jobs=1)
     assert found.misfit_in_sample == compared.misfit
-    ours, theirs = ({(c.capture, c.statistic): c.p for c in one.checks} for one in (found.found.in_sample, compared))
+    ours, theirs = ({(c.capture, c.statistic): c.p_value for c in one.checks} for one in (found.found.in_sample, compared))
     assert ours == theirs
 
 
