@@ -403,8 +403,28 @@ def test_a_fit_and_a_comparison_of_its_file_have_one_misfit(tmp_path, lab):
     assert written.effect("dead_time").duration == found.model.effect("dead_time").duration
     compared = sp.compare(written, data, jobs=1)
     assert found.misfit_in_sample == compared.misfit
-    ours, theirs = ({(c.capture, c.statistic): c.p_value for c in one.checks} for one in (found.found.in_sample, compared))
+    ours, theirs = (
+        {(c.capture, c.statistic): c.p_value for c in one.checks} for one in (found.found.in_sample, compared)
+    )
     assert ours == theirs
+
+
+def test_a_rate_of_which_nothing_was_seen_may_be_none() -> None:
+    """No count in 16 pixel-seconds in the dark: the likelihood falls by 1.92 at 0.12 Hz, and there is no lower end."""
+
+    def sensor(rate: float) -> sp.Sensor:
+        effects = [sp.effects.Detection(pdp=0.4), sp.effects.DarkCounts(rate=rate), sp.effects.DeadTime(duration=50e-9)]
+        return sp.Sensor(sp.Layout(4, 4, 25e-12, 1.0), [*effects, sp.effects.Tdc(resolution=1e-10)], rules="device")
+
+    flat = sp.Capture("flat", "tr", exposure=0.05, wavelength=500e-9, irradiance=1e-3, relative_uncertainty=0.02)
+    data = sp.simulate(sensor(1e-3), [sp.Capture("dark", "tr", exposure=1.0, dark=True), flat], seed=3)
+    assert data.recording("dark").totals.sum() == 0
+    fitted = sp.fit(sensor(100.0), data, free=["dark_counts.rate"], jobs=1)
+    found = sp.diagnose(sensor(100.0), data, quick=True, jobs=1)  # and no map of what was not counted
+    assert [step.candidate.name for step in found.steps] == ["set dark_counts.rate"]
+    for answer in (fitted, found):
+        rate = answer.steps[0].values["rate"]
+        assert rate.low == 0 and rate.high == pytest.approx(1.92 / 16, rel=0.02) and rate.value < 0.01
 
 
 @pytest.mark.slow

@@ -29,6 +29,9 @@ _MOST = 6  # the largest number of templates per strength of one candidate: the 
 # factor by which the search range reaches beyond a listed value at its end or outside, so that this may rise and fall;
 # a rule of thumb
 _BEYOND = 3.0
+# factor by which the search range of a listed strength reaches further down than that of an added one: the data may
+# show nothing of it. Of a dark rate the end is a count in 17 pixel-minutes; a rule of thumb
+_FEWER = 1e3
 _TURNED = 1.02  # factor on a parameter, to test whether the dead times follow it; any that is not rounded off does
 
 
@@ -210,6 +213,8 @@ def _about(value: float, declared: Parameter) -> tuple[float, float]:
     least, most = declared.bounds
     if 0 < value <= low:
         low = value / _BEYOND if low > 0 else low
+    if declared.off == 0 < low:
+        low /= _FEWER
     if value >= high:
         high = value * _BEYOND
     low = low if least is None else max(low, min(least, value))

@@ -32,6 +32,7 @@ class Coordinate:
             coordinate is the log of the distance to that end.
         kind: how it moves, one of `plugins.KINDS`.
         bounds: the least and the largest value that exist; None where there is no such bound.
+        absent: the value of a strength without which there is no effect, whatever is listed; None for a shape.
     """
 
     effect: str
@@ -42,6 +43,7 @@ class Coordinate:
     off: float | None
     kind: str = "smooth"
     bounds: tuple[float | None, float | None] = (None, None)
+    absent: float | None = None
 
     @property
     def key(self) -> Key:
@@ -83,8 +85,8 @@ class Coordinate:
         """The interval (low, high) of the values between two coordinates.
 
         The search range is no bound of the parameter: an interval may end a little beyond it, within `bounds`. One of
-        a strength that ends where the range does next to `off`, or far beyond, ends at `off`: the data do not exclude
-        that the effect is absent.
+        a strength that ends where the range does next to `absent`, or far beyond, ends at `absent`: the data do not
+        exclude that there is no effect.
         """
         low_bound, high_bound = self.bounds
         least = -math.inf if low_bound is None else low_bound
@@ -92,8 +94,8 @@ class Coordinate:
         beyond = _BEYOND if self.log else _BEYOND * (self.high - self.low)
         ends = []
         for u in (low, high):
-            if self.log and self.off is not None and self.off < self.low and self._at_least(u):
-                ends.append(self.off)
+            if self.log and self.absent is not None and self.absent < self.low and self._at_least(u):
+                ends.append(self.absent)
                 continue
             near = min(max(u, self.ends[0] - beyond), self.ends[1] + beyond)
             ends.append(min(max(self._anywhere(near), least), most))
@@ -140,6 +142,7 @@ def coordinate_of(effect: str, declared: Parameter, off: float | None) -> Coordi
         off=off,
         kind=declared.kind,
         bounds=declared.bounds,
+        absent=None if off is None else declared.off,
     )
 
 
