@@ -14,6 +14,7 @@ import re
 import secrets
 import shutil
 import stat
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -94,6 +95,26 @@ def check_outside(place: str | os.PathLike[str]) -> None:
             raise SpadError(
                 f"{place}: lies inside the dataset {folder}, which holds its own files alone; choose another -o"
             )
+
+
+def check_writable(place: str | os.PathLike[str], name: str = "") -> None:
+    """Raise SpadError where no file can be made at a place, or in it where it is a folder, before any work is done.
+
+    name: of the option, for the message.
+    """
+    folder = Path(place).absolute()
+    if not folder.is_dir():
+        folder = folder.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    named = f"{name} {place}".strip()
+    if not folder.is_dir():
+        raise SpadError(f"{named}: cannot be written, for {folder} is a file; choose another place")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise SpadError(f"{named}: cannot be written ({error.strerror or error}); choose another place") from None
 
 
 def _is_manifest(path: Path) -> bool:

@@ -99,6 +99,40 @@ def test_what_a_hot_pixel_causes_in_its_neighbours_is_not_theirs(frame: str, tmp
     assert np.all(np.abs(found[hot] / rates[hot] - 1) < 5 / np.sqrt(counts[hot]) + 0.01)
 
 
+def test_maps_of_the_dark_rate_and_the_pdp_together() -> None:
+    """Dark rates that spread by a factor of ten, of which a typical pixel has one count, in pixels that differ by 4 %.
+
+    The law of the rates is as wide as it is. The file has the fitted values of hot pixels, which are known well: the
+    prior of the other map, which informs them, is no prior of theirs.
+    """
+    draw = np.random.default_rng(512)
+    rate = draw.lognormal(np.log(20), 2.27, 32 * 32)
+    pdp = 0.444 * draw.normal(1, 0.04, 32 * 32)
+    stated, true = (
+        Sensor(Layout(32, 32, 36e-12, 1.0), [Detection(pdp=a), DarkCounts(rate=b)], rules="device")
+        for a, b in ((0.444, 265.0), (pdp, rate))
+    )
+    dark = spadmnist.Capture("dark", "qis", dark=True, frames=5000, frame_time=10e-6)
+    flat = spadmnist.Capture("flat", "qis", wavelength=500e-9, irradiance=2e-3, frames=2000, frame_time=10e-6)
+    data = spadmnist.simulate(true, [dark, flat], seed=1)
+    replicates = Replicates(stated, data, 0, Execution(Serial()), 4, reduced=False)
+    wanted = [c for c in candidates(replicates.start) if c.kind == "per_pixel"]
+    level = twin.photons_at(data.capture("flat"), stated.layout)
+    assert level is not None and len(wanted) == 2
+    maps = fit_maps(replicates, {}, wanted, {"dark": 1.0, "flat": level})
+    found = maps["dark_counts", "rate"]
+    values = map_values(found)["sigma"]
+    true_width = float(np.std(np.log(rate)))
+    assert values.low is not None and values.high is not None
+    error = (values.high - values.low) / (2 * 1.96)  # 0.07: 5 of them are a false alarm of 6e-7
+    assert abs(values.value - true_width) < 5 * error < 0.4
+    own = found.spread_values()
+    assert abs(float(np.std(np.log(own))) - true_width) < 0.4
+    hot = np.argsort(rate)[-5:]
+    assert own[hot] == pytest.approx(found.values()[hot], rel=1e-3)
+    assert np.all(np.abs(np.log(own[hot] / rate[hot])) < 5 / np.sqrt(rate[hot] * 0.05))
+
+
 def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:
     """2 counts a pixel, of one in ten 12: drawn maps have as many of each kind as the data, whatever the law is."""
     (tmp_path / "plan.yaml").write_text(CAPTURES.replace(str(FRAMES), "10000"))

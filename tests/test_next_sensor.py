@@ -344,3 +344,26 @@ def test_one_parameter_is_fitted_once(given: dict[str, list[str]], tmp_path: Pat
     lab = sp.simulate(model, [FLAT, sp.Capture("dark", "str", frames=4, frame_time=10e-6, dark=True, tick=1e-9)], 1)
     with pytest.raises(InputError, match=r"would be fitted twice.*; name it once"):
         sp.fit(model, lab, **given)
+
+
+@pytest.mark.parametrize(
+    ("verb", "options", "named"),
+    [
+        ("compare", ["--json"], "--json"),
+        ("diagnose", ["--json"], "--json"),
+        ("fit", ["--free", "dark_counts.rate", "-o", "next.yaml", "--json"], "--json"),
+        ("compare", ["-o"], "-o"),
+        ("diagnose", ["-o"], "-o"),
+        ("fit", ["--free", "dark_counts.rate", "-o"], "-o"),
+    ],
+)
+def test_a_place_where_nothing_can_be_written_is_refused_before_the_work(
+    verb: str, options: list[str], named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("a file, and no folder")
+    # neither sensor nor measurement is there: whoever began with them would speak of them
+    found = CliRunner().invoke(cli.cli, [verb, "sensor.yaml", "lab", *options, "file/answer"])
+    said = f"{named} file/answer: cannot be written, for {tmp_path / 'file'} is a file; choose another place"
+    assert str(found.exception) == said and not found.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]

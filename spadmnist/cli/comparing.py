@@ -50,7 +50,7 @@ def compare(
     spadmnist compare sensor.yaml lab/2025-03-01 -o report
     spadmnist compare sensor.yaml lab/2025-03-01 --tolerance "0.5 %" --json answer.json
     """
-    from .. import library, pages, units
+    from .. import disk, library, pages, units
     from ..errors import InputError
     from ..inference import comparison, next_step
 
@@ -64,6 +64,7 @@ def compare(
             raise InputError(f'--tolerance: {tolerance} is not a share of more than 0 and less than 1, like "0.5 %"')
     if output is not None:
         pages.check_place(output)
+        disk.check_writable(output, "-o")
     _check_answer(json_file, output, *_pages(output))
     with terminal.progress() as progress:
         found = library.compare(
@@ -129,10 +130,12 @@ def diagnose(
     spadmnist diagnose sensor.yaml lab/2025-03-01 -o next
     spadmnist diagnose sensor.yaml lab/2025-03-01 --plugin echo.py --json answer.json
     """
-    from .. import library
+    from .. import disk, library
     from ..inference import next_step, results
     from ..library.answers import ANSWER, SENSOR
 
+    if output is not None:
+        disk.check_writable(output, "-o")
     _check_answer(json_file, output, *_pages(output), *([output / SENSOR] if output else []))
 
     def keep(so_far: Diagnosis) -> None:
@@ -207,10 +210,11 @@ def fit(
     spadmnist fit sensor.yaml lab/2025-03-01 --add crosstalk -o next.yaml
     spadmnist fit sensor.yaml lab --free dead_time.duration --per-pixel detection.pdp -o next.yaml
     """
-    from .. import library, sensor_file
+    from .. import disk, library, sensor_file
     from ..inference import next_step, results
 
     sensor_file.check_place(sensor, output)
+    disk.check_writable(output, "-o")
     _check_answer(json_file, output)
     found = library.fit(
         sensor,
@@ -259,11 +263,13 @@ def _pages(folder: Path | None) -> list[Path]:
 
 def _check_answer(file: Path | None, *taken: Path | None) -> None:
     """Refuse to put an answer where something else is, or will be (`taken`), before any work is done."""
+    from .. import disk
     from ..errors import InputError
     from ..library.answers import check_answer
 
     if file is None:
         return
+    disk.check_writable(file, "--json")
     if any(file.resolve() == place.resolve() for place in taken if place is not None):
         raise InputError(f"--json {file}: is the place of -o, too; name a file, for example {file}.json")
     check_answer(file, "--json")

@@ -230,9 +230,11 @@ class _Fitted:
     def map(self, of_scene: bool) -> PixelMap:
         """The map as fitted."""
         assert self.candidate.carrier is not None
+        own = np.maximum(1 / np.maximum(self.variance, 1e-30) - self.precision, 1e-12)  # of counts and other maps
         return PixelMap(
             carrier=self.candidate.carrier,
             base=self.base,
+            held=self.precision / own,
             group=self.group,
             estimate=self.logs,
             error=np.sqrt(np.maximum(self.variance, 0)),
@@ -430,7 +432,9 @@ def _of_few_counts(
     mean, error = mean_of(weights, grid)
     informed = map_.raw_error < INFORMED
     estimate, error = np.where(informed, map_.estimate, mean), np.where(informed, map_.error, error)
-    return replace(map_, estimate=estimate, error=error, likely=(grid, weights), prior=prior)
+    alone = np.maximum(np.minimum(map_.raw_error**2, MOST) / np.maximum(error**2, 1e-30) - 1, 0.0)
+    held = alone if map_.held is None else np.where(informed, map_.held, alone)
+    return replace(map_, estimate=estimate, error=error, likely=(grid, weights), prior=prior, held=held)
 
 
 def _by_their_law(likely: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

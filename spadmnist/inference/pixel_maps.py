@@ -41,9 +41,9 @@ MOST = 10.0
 ODD, WIDE = 3.5, 2.0
 CODES = "codes"  # the statistic of the codes
 _PERIODS = (256, 140, 100)  # plain meaning: the periods that `statistics.codes` folds codes with
-# the grid of log values about the middle for pixels with few counts (from, to, points); the iterations for their law,
-# which ends while it is smooth
-GRID, ROUNDS = (-4.0, 8.0, 97), 100
+# the grid of log values about the middle for pixels with few counts (from, to, points): a law of width 2.3, as of dark
+# rates, is not cut off (from -4 on it was 1.9); the iterations for their law, which ends while it is smooth
+GRID, ROUNDS = (-8.0, 8.0, 129), 100
 # reliability, the share of the variance of values that their estimates have: above the first a value is known well, its
 # spread being too small by 1 %; below the second it spreads as if it had so much, lest noise be blown up five times
 RELIABLE, LEAST_RELIABLE = 0.98, 0.04
@@ -69,6 +69,8 @@ class PixelMap:
         raw, raw_error: (groups,) the same without the prior.
         sigma: width of the prior.
         low, high: bounds of the values.
+        held: (groups,) the ratio of the prior's information on each value to that of its data, where other maps were
+            fitted with it: their priors inform the estimate, too, and not the one without a prior. None: by the errors.
         shape: (rows, columns) of the pixels, where each has a value of its own; None of rows, columns, codes.
     """
 
@@ -87,6 +89,7 @@ class PixelMap:
     certain: float = INFORMED  # raw_error below which a value is the estimate, whatever the others are
     width: blind_times.Width | None = None  # where the likelihood of all pixels gives it
     shape: tuple[int, int] | None = None
+    held: np.ndarray | None = None
     of_scene: bool = False  # no light falls on some pixels, and nothing says how much of it they detect
 
     @property
@@ -167,6 +170,8 @@ class PixelMap:
     @property
     def _pulled(self) -> np.ndarray:
         """(groups,) the ratio of the prior's information on each value to that of its data."""
+        if self.held is not None:
+            return self.held
         return np.maximum(np.minimum(self.raw_error**2, MOST) / np.maximum(self.error**2, 1e-30) - 1, 0.0)
 
     def values(self, draw: np.ndarray | None = None, width: float = 0.0) -> np.ndarray:
