@@ -55,7 +55,7 @@ def after_diagnosis(
         return "nothing is missing; a brighter, a darker or a longer capture tests the model further."
     if found.advice and found.verdict == "confused":
         return f"take {found.advice[-1]['capture']}, add it to the measurement, and diagnose again."
-    if found.or_setup:
+    if found.verdict == "confused" and found.or_setup:
         last = found.steps[-1]
         start = new if len(found.steps) > 1 and new else sensor  # the file has the steps before it
         option = f"--add {last.effect}" if last.change == "add" else f"--free {last.effect}.{last.parameter}"
