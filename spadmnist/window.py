@@ -192,8 +192,10 @@ def _ends(part: slice, size: int, what: str, text: str) -> tuple[int, int]:
             f"{text}: the {what}s {_shown(part)} reach beyond the sensor's {have}; name a part of 0:{size}"
         )
     if start >= stop:
+        negative = any(end < 0 for end in given)
+        from_the_end = f" (a negative end counts from the last one: here {start}:{stop})" if negative else ""
         raise InputError(
             f"{text}: between the {what}s {_shown(part)} lies none; the first end must be less than the second, which "
-            f"is excluded, for example 0:{size}"
+            f"is excluded, for example 0:{size}{from_the_end}"
         )
     return start, stop

@@ -519,6 +519,7 @@ def test_a_part_is_written_as_python_writes_slices() -> None:
         ("0:2,9:11", r"the columns 9:11 reach beyond the sensor's 10 columns; name a part of 0:10"),
         ("5:5,0:4", r"between the rows 5:5 lies none"),
         ("0:2,7:3", r"between the columns 7:3 lies none.*example 0:10"),
+        ("-4:2,0:4", r"between the rows -4:2 lies none.*counts from the last one: here \d+:2"),
     ],
 )
 def test_what_is_no_part_is_told(text: str, said: str) -> None:
