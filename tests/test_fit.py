@@ -313,7 +313,7 @@ def test_a_profile_is_as_uneven_as_the_model_and_ends_at_a_bound(monkeypatch):
     ],
 )
 def test_where_a_number_is_looked_for_is_no_bound_of_what_it_may_be(ends, bounds, off, reach, expected):
-    coordinate = Coordinate("any", "a", "", *ends, off, bounds=bounds)
+    coordinate = Coordinate("any", "a", "", *ends, off, bounds=bounds, absent=off)
     assert coordinate.interval(*reach) == pytest.approx(expected)
     assert all(ends[0] <= coordinate.value(u) <= ends[1] for u in reach)
 
@@ -409,6 +409,7 @@ def test_a_fit_and_a_comparison_of_its_file_have_one_misfit(tmp_path, lab):
     assert ours == theirs
 
 
+@pytest.mark.slow
 def test_a_rate_of_which_nothing_was_seen_may_be_none() -> None:
     """No count in 16 pixel-seconds in the dark: the likelihood falls by 1.92 at 0.12 Hz, and there is no lower end."""
 

@@ -121,6 +121,7 @@ def test_compare_runs_nothing_of_the_current_folder(watched: Watched, tmp_path: 
     assert not marker.exists(), marker.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", [["-m", "spadmnist"], ["-Bmspadmnist.cli"]])
 def test_a_module_of_the_program_leaves_the_current_folder(module: list[str], watched: Watched, tmp_path: Path) -> None:
     command = [sys.executable, *module]
@@ -129,6 +130,7 @@ def test_a_module_of_the_program_leaves_the_current_folder(module: list[str], wa
     assert not marker.exists(), marker.read_text()
 
 
+@pytest.mark.slow
 def test_an_empty_entry_of_the_path_is_not_the_current_folder(watched: Watched, program: Path, tmp_path: Path) -> None:
     """As it comes of PYTHONPATH=$PYTHONPATH:/some/folder."""
     command = [sys.executable, str(program)]
