@@ -102,15 +102,15 @@ def check_writable(place: str | os.PathLike[str], name: str = "") -> None:
 
     name: of the option, for the message.
     """
-    folder = Path(place).absolute()
-    if not folder.is_dir():
-        folder = folder.parent
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
     named = f"{name} {place}".strip()
-    if not folder.is_dir():
-        raise SpadError(f"{named}: cannot be written, for {folder} is a file; choose another place")
     try:
+        folder = Path(place).absolute()
+        if not folder.is_dir():
+            folder = folder.parent
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        if not folder.is_dir():
+            raise SpadError(f"{named}: cannot be written, for {folder} is a file; choose another place")
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:

@@ -51,6 +51,8 @@ class Layout:
             raise InputError(
                 f"positions have shape {np.shape(self.positions)}; they are (pixels, 2) in m, here ({self.pixels}, 2)"
             )
+        if self.positions is not None and self.rows != 1:
+            raise InputError(f"pixels with positions are one row, Layout(1, {self.pixels}, ...), not {self.rows} rows")
 
     @property
     def pixels(self) -> int:

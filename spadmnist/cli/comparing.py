@@ -269,10 +269,10 @@ def _check_answer(file: Path | None, *taken: Path | None) -> None:
 
     if file is None:
         return
-    disk.check_writable(file, "--json")
     if any(file.resolve() == place.resolve() for place in taken if place is not None):
         raise InputError(f"--json {file}: is the place of -o, too; name a file, for example {file}.json")
     check_answer(file, "--json")
+    disk.check_writable(file, "--json")
 
 
 def _write_answer(file: Path | None, text: str) -> None:

@@ -11,6 +11,9 @@ from ..events import Children, Events
 from ..streams import Draws
 from . import Chip, Conditions, Effect, parameter
 
+# neighbours of a pixel on a grid, from which on the closed form is by the fast Fourier transform: with 380 of them that
+# is 10 times as fast, with about this many as fast (256 x 256 pixels)
+_MANY = 24
 _CERTAIN = 40.0  # hazard of a neighbour that is hit for certain: exp(-40) is less than any draw can resolve
 
 
@@ -90,6 +93,14 @@ class Crosstalk(Effect, stage="correlated"):
             home = np.repeat(np.arange(layout.pixels), np.diff(self._first))
             self._steps = np.stack([step - home, 0 * home], axis=1)
         self._chance = chance
+        self._spectrum: np.ndarray | None = None
+        if near.first is None and len(chance) > _MANY:
+            rows, columns = layout.shape
+            away = np.abs(step).max(axis=0)
+            self._padded = (rows + int(away[1]), columns + int(away[0]))  # so that none comes round the end
+            kernel = np.zeros(self._padded)
+            kernel[step[:, 1], step[:, 0]] = chance
+            self._spectrum = np.fft.rfft2(kernel)
         with np.errstate(divide="ignore"):
             hazard = np.minimum(-np.log1p(-chance), _CERTAIN)
         self._shape = layout.shape
@@ -107,6 +118,11 @@ class Crosstalk(Effect, stage="correlated"):
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """rate + sum over the other pixels of chance(their distance) * their rate."""
+        if self._spectrum is not None:
+            images = rate.reshape(len(rate), *self._shape)
+            reached = np.fft.irfft2(np.fft.rfft2(images, self._padded) * self._spectrum, self._padded)
+            rows, columns = self._shape
+            return rate + np.maximum(reached[:, :rows, :columns], 0.0).reshape(rate.shape)
         before, after = np.array(rate, order="C"), np.array(rate, order="C")
         _receive(after, before, self._first, self._chance, self._steps, *self._shape)
         return after

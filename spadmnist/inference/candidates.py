@@ -213,7 +213,7 @@ def _about(value: float, declared: Parameter) -> tuple[float, float]:
     least, most = declared.bounds
     if 0 < value <= low:
         low = value / _BEYOND if low > 0 else low
-    if declared.off == 0 < low:
+    if declared.kind == "smooth" and declared.off == 0 < low:
         low /= _FEWER
     if value >= high:
         high = value * _BEYOND

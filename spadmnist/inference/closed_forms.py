@@ -106,7 +106,7 @@ def events_in_frames(sensor: Sensor, light: np.ndarray, conditions: Conditions) 
     within = conditions.within_frames
     if conditions.live is not None:
         within = replace(conditions, live=max(conditions.live + sensor.origin, 0.0))
-    return np.asarray(sensor.expected(light, within)[0] / conditions.frames)
+    return np.asarray(sensor.expected(light, within, first=True)[0] / conditions.frames)
 
 
 def most_detections(capture: Capture, pixels: int) -> float:

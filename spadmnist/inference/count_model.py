@@ -45,8 +45,15 @@ class CountModel:
         return np.asarray(np.maximum(self.waited * events, 1e-9))
 
     def alone(self, sensor: Sensor) -> np.ndarray:
-        """The expected detections of each pixel without those that other pixels cause, (pixels,)."""
-        own = [e for e in sensor.effects if not 0 < e.influence() < math.inf]
+        """The expected detections of each pixel without those that other pixels cause, (pixels,).
+
+        An effect with values of the pixels stays: a map of them is one of their own.
+        """
+        own = [
+            e
+            for e in sensor.effects
+            if not 0 < e.influence() < math.inf or any(p.per_pixel for p in e.parameters.values())
+        ]
         return self.expected(sensor if len(own) == len(sensor.effects) else sensor.changed(effects=own))
 
     def log_likelihood(self, expected: np.ndarray) -> np.ndarray:

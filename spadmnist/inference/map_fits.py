@@ -94,6 +94,8 @@ class _Fitted:
         low: smallest value that the parameter may have.
         high: largest value.
         of_light: the map acts on the light, so that its mean is that of the light level.
+        dark: a capture without light informs it. Without one most pixels keep the listed value: a common change is
+            confused with the light level.
         logs: (groups,) estimates.
         variance: (groups,) of the estimates.
         raw: (groups,) estimates without the prior.
@@ -111,6 +113,7 @@ class _Fitted:
     low: float
     high: float
     of_light: bool
+    dark: bool
     logs: np.ndarray
     variance: np.ndarray
     raw: np.ndarray
@@ -122,8 +125,8 @@ class _Fitted:
     sigma: float = _FIRST_WIDTH
 
     @classmethod
-    def of(cls, start: Sensor, candidate: Candidate) -> _Fitted:
-        """The map before its first iteration."""
+    def of(cls, start: Sensor, candidate: Candidate, dark: bool) -> _Fitted:
+        """The map before its first iteration; `dark` as the attribute."""
         assert candidate.carrier is not None
         declared = Effect.registry.find(candidate.carrier[0]).parameters[candidate.carrier[1]]
         base, group = base_of(start, candidate), groups_of(start, candidate.per)
@@ -136,6 +139,7 @@ class _Fitted:
             low=low,
             high=high,
             of_light=acts_on_light(start, candidate),
+            dark=dark,
             logs=np.zeros(size),
             variance=np.ones(size),
             raw=np.zeros(size),
@@ -183,6 +187,9 @@ class _Fitted:
         weight = (TAILS + 1) / (TAILS + (self.logs - self.middle) ** 2 / self.sigma**2)
         if self.of_light:
             self.logs = self.logs - math.log(float(np.mean(np.exp(self.logs))))
+        elif not self.dark:
+            self.logs = self.logs - float(np.average(self.logs, weights=weight))
+            self.middle = 0.0
         else:  # the mean of all pixels, which no pixel by itself may inform
             own, rest = self.sums(normal, weight), self.sums(left, weight)
             shift = float(np.clip(rest.sum() / max(float(own.sum()), 1e-12), -_LARGEST_SHIFT, _LARGEST_SHIFT))
@@ -225,7 +232,7 @@ class _Fitted:
         square = max(float((null_counts**2).sum()), 1e-12)  # the noise of a single odd pixel is left out
         # relative variance of the counts; that of the logarithms is smaller
         relative = float(((counted - null_counts) ** 2 - null_counts).sum()) / square
-        return math.sqrt(max(math.log1p(max(relative, 0.0)), LEAST_WIDTH**2))
+        return min(math.sqrt(max(math.log1p(max(relative, 0.0)), LEAST_WIDTH**2)), _WIDTHS[1])
 
     def map(self, of_scene: bool) -> PixelMap:
         """The map as fitted."""
@@ -307,7 +314,8 @@ def fit_maps(
         for id, s in replicates.seen.items()
         if s.counts is not None and (not use or id in use)
     ]
-    fitted = [_Fitted.of(start, candidate) for candidate in wanted]
+    dark = any(line.seen.capture.light.dark for line in lines)
+    fitted = [_Fitted.of(start, candidate, dark) for candidate in wanted]
 
     def model(logs: Sequence[np.ndarray]) -> Sensor:
         maps = {one.candidate.carrier: one.value(own) for one, own in zip(fitted, logs, strict=True)}
@@ -370,7 +378,7 @@ def _normal_equations(
         # until the level is that of these maps, and no factor is needed
         line.level *= min(max(scale, 1 / _LEVEL_STEP), _LEVEL_STEP)
         alone = line.alone(now)  # of a pixel's own value: what its neighbours cause there is that of their values
-        jacobian = np.stack([(line.alone(o) - alone) / _DIFFERENCE for o in other], axis=1) * scale
+        jacobian = np.stack([(line.alone(o) - alone) / _DIFFERENCE for o in other], axis=1)
         expected = expected * scale
         variance = line.variance(np.maximum(expected, 0.5), dead)
         normal += jacobian[:, :, None] * jacobian[:, None, :] / variance[:, None, None]

@@ -391,6 +391,10 @@ def test_the_closed_form_of_crosstalk_says_which_pixel_it_comes_from() -> None:
         chance = np.where((distance > 0) & (distance < 1.5), effect.chance(np.maximum(distance, 1)), 0.0)
         expected = effect.expected_rate(rate, exposure_of(1.0))
         assert expected == pytest.approx(rate + rate @ chance)
+    far = crosstalk_of(grid, probability=0.06, diagonal_ratio=0.5, far_ratio=0.4, reach=12)  # farther than the array
+    chance = np.where(distance > 0, far.chance(np.maximum(distance, 1)), 0.0)
+    many = np.concatenate([rate, 2 * rate[:, ::-1]])
+    assert far.expected_rate(many, exposure_of(1.0)) == pytest.approx(many + many @ chance)
     recorded = exposed(
         grid, rate[0], [Crosstalk(probability=0.06, diagonal_ratio=0.5)], exposure_of(0.01), 3000, "paper"
     )
