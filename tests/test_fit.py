@@ -511,7 +511,7 @@ def test_what_cannot_be_fitted_is_told_with_what_can(made):
     [
         ("dark_counts.rate", 0.2, 5.0, 500.0),
         ("dark_counts.rate", 1e6, 1e3, 2e-3),
-        ("dark_counts.rate", 0.0, 1e3, 1e-4),  # no detection: the data do not say how far below 1 Hz it is
+        ("dark_counts.rate", 0.0, 1e3, 1e-4),  # no detection: the data do not say that there is any
         ("dead_time.duration", 5e-6, 0.5e-6, 1.0),
     ],
 )
@@ -536,4 +536,4 @@ def test_the_range_of_a_search_does_not_bound_a_named_fit(
     if hidden:
         assert abs(found.value - hidden) < 5 / 3.92 * (found.high - found.low) and found.low < found.value < found.high
     else:
-        assert 0.9 < found.value <= 1.0 and found.high > 1e3
+        assert found.low == 0 and found.value < 1 and found.high > 1e3
