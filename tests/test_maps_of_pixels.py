@@ -45,6 +45,16 @@ captures:
 """
 
 
+def fitted(sensor: Sensor, rates: np.ndarray, folder: Path) -> tuple[Replicates, PixelMap]:
+    """(the captures of the folder's plan with these dark rates, reduced; the map fitted to them)."""
+    truth = with_values(sensor, {("dark_counts", "rate"): rates})
+    plan = measurements.open(folder / "plan.yaml", planned=True)
+    data = measurements.open(twin.simulate(truth, plan, folder / "lab", 5))
+    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
+    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
+    return replicates, fit_maps(replicates, {}, [candidate], {"dark": 1.0})["dark_counts", "rate"]
+
+
 @pytest.mark.parametrize("usual", [20.0, 200.0])
 def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp_path: Path) -> None:
     """The sensor lists the mean of pixels of which nearly all are quiet, or what most of them have."""
@@ -53,12 +63,8 @@ def test_a_few_hot_pixels_are_told_from_many_that_hardly_count(usual: float, tmp
     sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
     rates = np.full(SIDE * SIDE, usual)
     rates[[3, 77, 150, 256, 300]] = [200.0, 400.0, 2000.0, 9000.0, 60_000.0]
-    truth = with_values(sensor, {("dark_counts", "rate"): rates})
-    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
-    data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
-    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
-    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
-    found = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")].values()
+    replicates, map_ = fitted(sensor, rates, tmp_path)
+    found = map_.values()
     counts = replicates.seen["dark"].counts
     assert counts is not None
     expected = found * FRAMES * 1e-6
@@ -79,15 +85,10 @@ def test_what_a_hot_pixel_causes_in_its_neighbours_is_not_theirs(frame: str, rat
     (tmp_path / "sensor.yaml").write_text(SENSOR + "    crosstalk: {probability: 0.02, diagonal_ratio: 0.0}\n")
     sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
     hot = np.array([85, 153, 256, 314])
-    beside = (hot[:, None] + [-SIDE, -1, 1, SIDE]).ravel()
+    beside = np.concatenate([hot - SIDE, hot - 1, hot + 1, hot + SIDE])
     rates = np.full(SIDE * SIDE, 200.0)
     rates[hot] = rate
-    truth = with_values(sensor, {("dark_counts", "rate"): rates})
-    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
-    data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
-    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
-    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
-    map_ = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")]
+    replicates, map_ = fitted(sensor, rates, tmp_path)
     found = map_.values()
     counts = replicates.seen["dark"].counts
     assert counts is not None
@@ -95,8 +96,8 @@ def test_what_a_hot_pixel_causes_in_its_neighbours_is_not_theirs(frame: str, rat
     few = frame == "1 us"
     assert abs(expected.sum() / counts.sum() - 1) < (0.05 if few else 2e-3)
     # 16 pixels of 12 (1200) counts and up to as many that are caused
-    share, error = float(np.mean(found[beside])) / 200, math.sqrt(2 / ((12 if few else 1200) * 16))
-    assert abs(share - 1) < 5 * error
+    own = 16 * (12 if few else 1200)
+    assert abs(float(np.mean(found[beside])) / 200 - 1) < 5 * math.sqrt(2 / own)
     assert np.all(np.abs(found[hot] / rates[hot] - 1) < 5 / np.sqrt(counts[hot]) + 0.01)
 
 
@@ -161,12 +162,7 @@ def test_the_law_of_pixels_that_say_little_each(tmp_path: Path) -> None:
     sensor = config.read_sensor(tmp_path / "sensor.yaml").resolved()
     rates = np.full(SIDE * SIDE, 200.0)
     rates[::10] = 1200.0
-    truth = with_values(sensor, {("dark_counts", "rate"): rates})
-    plan = measurements.open(tmp_path / "plan.yaml", planned=True)
-    data = measurements.open(twin.simulate(truth, plan, tmp_path / "lab", 5))
-    replicates = Replicates(sensor, data, 0, Execution(Serial()), 8)
-    candidate = next(c for c in candidates(sensor) if c.name == "per_pixel dark_counts.rate")
-    map_ = fit_maps(replicates, {}, [candidate], {"dark": 1.0})[("dark_counts", "rate")]
+    replicates, map_ = fitted(sensor, rates, tmp_path)
     counts = replicates.seen["dark"].counts
     assert counts is not None and map_.likely is not None
     rng = np.random.default_rng(6)

@@ -12,7 +12,7 @@ from ..streams import Draws
 from . import Chip, Conditions, Effect, parameter
 
 # neighbours of a pixel on a grid, from which on the closed form is by the fast Fourier transform: with 380 of them that
-# is 10 times as fast, with about this many as fast (256 x 256 pixels)
+# is some 10 times as fast (256 x 256 pixels); a rule of thumb
 _MANY = 24
 _CERTAIN = 40.0  # hazard of a neighbour that is hit for certain: exp(-40) is less than any draw can resolve
 
