@@ -115,6 +115,7 @@ def test_the_limit_of_a_drift_is_what_a_ramp_of_so_many_detections_tells(lab):
 # --- steps that are none -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
     path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
     taken(path, "add afterpulsing", {PROBABILITY: 1e-4, LIFETIME: 50e-9}, fitted=False)
@@ -125,6 +126,7 @@ def test_a_step_that_later_ones_make_needless_is_taken_out(lab):
     assert path.ladder[-1].model == "- afterpulsing"
 
 
+@pytest.mark.slow
 def test_what_was_fitted_beside_a_needless_step_is_fitted_from_its_own_templates(lab):
     """A lifetime of 450 ns has no gradient that leads to the true one of 25 ns."""
     path = begin(bench_of(lab("    afterpulsing: {probability: 5 %, lifetime: 25 ns}\n")))
@@ -136,6 +138,7 @@ def test_what_was_fitted_beside_a_needless_step_is_fitted_from_its_own_templates
     assert path.values[PROBABILITY] == pytest.approx(0.05, rel=0.3)
 
 
+@pytest.mark.slow
 def test_going_back_restores_the_values_of_the_steps_before(lab):
     path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n")))
     taken(path, "add crosstalk", {CROSSTALK: 0.03})

@@ -199,6 +199,7 @@ def test_pixels_that_are_alike_have_a_map_of_one_value(benches: dict[float, tupl
     assert np.median(np.abs(drawn / DEAD - 1)) < 2e-3 and np.median(np.abs(map_.values() / DEAD - 1)) < 2e-3
 
 
+@pytest.mark.slow
 def test_the_chance_of_a_map_of_dead_times(benches: dict[float, tuple[Replicates, np.ndarray]]) -> None:
     for spread, (replicates, _) in benches.items():
         evaluation = evaluate(replicates, {})

@@ -22,6 +22,7 @@ def lab(tmp_path):
     return labs(tmp_path)
 
 
+@pytest.mark.slow
 def test_only_the_captures_that_show_a_change_are_simulated(lab) -> None:
     """The others have the replicates of the model without it, at the level that gives as many detections."""
     replicates = bench_of(lab("    crosstalk: {probability: 3 %}\n"), 16)

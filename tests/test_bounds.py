@@ -80,6 +80,7 @@ def bomb(folder: Path, size: int, exposure: str = "1 s", **filters: Any) -> Path
     return folder
 
 
+@pytest.mark.slow
 def test_a_chunk_unpacks_to_no_more_than_its_shape(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"dark\.h5: time has a chunk that unpacks to more than the 1,048,576 bytes"):
         measurement.open(bomb(tmp_path / "lab", 512 << 20)).recording("dark")
@@ -173,6 +174,7 @@ DONE: dict[str, Callable[[Path, Path], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", DONE)
 def test_a_detection_costs_its_stamp(what: str, many: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Counted by tracemalloc, what numpy takes and a little more; the same was done once before, to compile kernels.

@@ -148,6 +148,7 @@ def test_a_time_as_people_read_it():
     assert [clock(x) for x in (4.4, 250, 3720)] == ["0:04", "4:10", "1:02:00"]
 
 
+@pytest.mark.slow
 def test_a_budget_ends_a_search_and_the_answer_says_so(lab, few, monkeypatch):
     monkeypatch.setattr("spadmnist.inference.budget._SLOW", 1e9)  # work alone ends it, however slow this machine is
     made = lab(AFTERPULSING)

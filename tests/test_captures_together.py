@@ -130,6 +130,7 @@ LAWS: dict[str, tuple[str, Callable[..., np.ndarray], int]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [0.0, 0.9], ids=["", "one chip"])
 @pytest.mark.parametrize("name", LAWS)
 def test_p_values_of_a_right_model_are_no_smaller_than_uniform(name: str, shared: float) -> None:
@@ -184,6 +185,7 @@ def with_echo(recording: Recording, share: float, rng: np.random.Generator) -> t
     return np.concatenate(ticks), np.concatenate(pixels)
 
 
+@pytest.mark.slow
 def test_compare_finds_an_echo_that_no_capture_shows_by_itself(tmp_path: Path) -> None:
     layout = "format: spadmnist-measurement/1\nname: lab\nlayout: {rows: 2, columns: 2}\ncaptures:\n"
     (tmp_path / "plan.yaml").write_text(layout + "".join(FLAT.replace("ID", str(k)) for k in range(5)))

@@ -129,6 +129,7 @@ def test_an_effect_that_loses_the_causes_is_named() -> None:
 # --- counts -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_cascade_without_end_is_refused_before_it_fills_the_memory() -> None:
     """Every avalanche fires 3 others in the mean: 3^n in generation n, on an array that is never wholly blind."""
     many = sensor("device", crosstalk={"probability": 0.6, "delay": 1e-6})

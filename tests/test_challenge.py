@@ -88,6 +88,7 @@ def test_a_wrong_dead_time_is_seen() -> None:
         laws.mean_is(seen, renewal_mean(5e6, 45e-9, 1e-3))
 
 
+@pytest.mark.slow
 def test_dead_time_fano() -> None:
     """Fano factor 1 / (1 + lambda tau)^2; the law's next term is below a hundredth here."""
     rate, dead, length = 6e6, 50e-9, 50e-6
@@ -273,6 +274,7 @@ def test_the_oracle_significance_of_crosstalk_in_first_stamps_is_its_likelihood_
     assert z > 10 * hidden.oracle.within_frames(lab, np.array([chance]))
 
 
+@pytest.mark.slow
 def test_the_oracle_significance_of_a_sine_is_what_a_sine_shows() -> None:
     """A matched filter that knows phase and frequency, on generated data, has the stated Z within its scatter of 1."""
     lab = hidden.Lab("tr", 5)
@@ -286,6 +288,7 @@ def test_the_oracle_significance_of_a_sine_is_what_a_sine_shows() -> None:
     assert abs(math.sqrt(squares) - what.z) < 0.1 * what.z + 4
 
 
+@pytest.mark.slow
 def test_the_oracle_significance_of_a_random_level_is_what_its_spectrum_shows() -> None:
     """The likelihood ratio of the powers, law and numbers known, on generated data: no method reaches more."""
     lab = hidden.Lab("tr", 6)
@@ -415,6 +418,7 @@ def made(small: Any, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_cases_are_measurements_and_say_nothing_of_their_truth(made: Path) -> None:
     folders = sorted(path for path in (made / "cases").iterdir() if path.is_dir())
     assert [path.name for path in folders] == [f"case-{k:03d}" for k in range(1, 9)]
@@ -426,6 +430,7 @@ def test_cases_are_measurements_and_say_nothing_of_their_truth(made: Path) -> No
         assert not any(word in told for word in ("crosstalk", "null", "hidden", "copied", "truth"))
 
 
+@pytest.mark.slow
 def test_a_case_is_the_same_whichever_others_are_made(made: Path, tmp_path: Path) -> None:
     alone = tmp_path / "alone"
     assert challenge.main(["make", "tr-crosstalk-clear", "-o", str(alone), "--seed", "2", "--jobs", "1"]) == 0
@@ -819,6 +824,7 @@ def stub(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_answers_are_kept_and_asked_for_once(made: Path, stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert challenge.main(["run", str(made), "--jobs", "1"]) == 1
     failed = json.loads((made / "answers" / "case-002.diagnose.json").read_text())
@@ -896,6 +902,7 @@ def test_a_part_of_the_cases_is_scored(
     assert f"{made}: case-001: the truth is not the one that was sealed" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_has_failed_is_asked_last(made: Path, stub: Path) -> None:
     assert challenge.main(["run", str(made), "--jobs", "1", "--ask", "diagnose"]) == 1
     for path in (made / "answers").glob("case-00[5-8].diagnose.json"):
@@ -909,6 +916,7 @@ def test_what_has_failed_is_asked_last(made: Path, stub: Path) -> None:
 # ---- unseen captures --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_unseen_captures_are_others(made: Path) -> None:
     for place in sorted((made / "unseen").iterdir()):
         shown, later = measurement.open(made / "cases" / place.name), measurement.open(place)
@@ -942,7 +950,9 @@ def test_the_right_sensor_removes_the_error_of_unseen_captures(small: Any, tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["null-tr-1", "null-qis-1", "null-str-1"])
+@pytest.mark.parametrize(
+    "case", ["null-tr-1", *(pytest.param(f"null-{one}-1", marks=pytest.mark.long) for one in ("qis", "str"))]
+)
 def test_the_package_agrees_with_the_generator(case: str, tmp_path: Path) -> None:
     """Two programs that share nothing make the same sensor. A right model is called wrong once in a hundred."""
     folder = tmp_path / "out"

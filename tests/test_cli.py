@@ -97,6 +97,7 @@ def test_help_is_there_at_once() -> None:
 # --- exit statuses and streams ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nothing_to_do_is_said_on_standard_error(made: tuple[Path, Path]) -> None:
     result = run("generate", made[0], "-o", made[1])
     assert result.returncode == 0
@@ -162,6 +163,7 @@ def quiet(result: subprocess.CompletedProcess[str]) -> None:
         assert word not in result.stderr, result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_reader_that_goes_away(command: str, made: tuple[Path, Path]) -> None:
     for reader in ("head -c 1", "true"):
@@ -265,6 +267,7 @@ def test_dry_run_for_people(made: tuple[Path, Path], tmp_path: Path) -> None:
     assert tree(tmp_path) == {}
 
 
+@pytest.mark.slow
 def test_dry_run_says_what_is_there(made: tuple[Path, Path], tmp_path: Path) -> None:
     file, root = made
     shutil.copytree(root, tmp_path / "out")
@@ -343,6 +346,7 @@ def test_unknown_names(verb: str, made: tuple[Path, Path]) -> None:
 # --- an effect of one's own ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_new_effect_by_the_commands_that_are_told(made: tuple[Path, Path], tmp_path: Path) -> None:
     """What is printed is typed, one after the other."""
     told = run("effects", "--new", "light_leak", cwd=tmp_path)
@@ -424,6 +428,7 @@ def test_a_plug_in_that_cannot_be_loaded(
     assert sorted(tree(tmp_path)) == ["mine.py"]
 
 
+@pytest.mark.slow
 def test_positions_that_cannot_be(made: tuple[Path, Path], tmp_path: Path) -> None:
     text = made[0].read_text().replace("layout: {rows: 8, columns: 8,", "layout: {positions: places.csv,")
     assert "places.csv" in text
@@ -504,6 +509,7 @@ def test_levels_in_any_spelling(level: str, tmp_path: Path) -> None:
         assert run("verify", tmp_path / "out").returncode == 0
 
 
+@pytest.mark.slow
 def test_a_vast_number_of_images_is_planned_at_once(made: tuple[Path, Path], tmp_path: Path) -> None:
     """All of them are the same: none need be looked at twice."""
     text = (
@@ -526,6 +532,7 @@ def test_a_vast_number_of_images_is_planned_at_once(made: tuple[Path, Path], tmp
 # --- places -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_places_that_are_taken(made: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     (tmp_path / "foreign").mkdir()

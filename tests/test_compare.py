@@ -151,6 +151,7 @@ WRONG = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("modality", "changed", "where"), WRONG, ids=lambda v: v if isinstance(v, str) else None)
 def test_a_wrong_model_fails_at_the_right_place(
     modality: str, changed: dict[str, dict[str, Any]], where: set[str]
@@ -193,6 +194,7 @@ def test_what_a_model_states_of_its_windows_is_no_misfit() -> None:
         assert check.misfit < 3, (check.capture, check.statistic, check.misfit)
 
 
+@pytest.mark.slow
 def test_what_is_smaller_than_the_tolerance_passes_as_not_material() -> None:
     data = measured(sensor(dark_counts={"rate": 250.0}), "tr", 6)
     strict, tolerant = compared(sensor(), data), compared(sensor(), data, tolerance=0.9)
@@ -308,6 +310,7 @@ def test_stamps_in_other_ticks_are_rounded_down() -> None:
     assert bits.on_ticks(1e-8) is bits
 
 
+@pytest.mark.slow
 def test_a_free_level_is_found_and_a_known_mean_is_enough() -> None:
     lit = Capture("free", "tr", Light(500e-9), Conditions(0.01, 1, 0.01, 0.01, 500e-9))
 
@@ -384,7 +387,9 @@ def case(name: str) -> Comparison:
 
 @challenge
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["open-tr-null", "open-qis-null", "open-str-null"])
+@pytest.mark.parametrize(
+    "name", ["open-tr-null", *(pytest.param(f"open-{one}-null", marks=pytest.mark.long) for one in ("qis", "str"))]
+)
 def test_nulls_of_another_simulator_are_adequate(name: str) -> None:
     found = case(name)
     assert found.verdict == "adequate", [(c.statistic, c.capture, c.p_value) for c in found.failing]
@@ -406,7 +411,9 @@ PLACES = {
 
 @challenge
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if k % 3 else ()) for k, name in enumerate(PLACES)]
+)
 def test_hidden_effects_are_seen_where_they_are(name: str) -> None:
     found = case(name)
     assert found.verdict == "fails"
@@ -424,6 +431,7 @@ def test_one_case_of_the_challenge_in_short() -> None:
     assert "-15" in light.size
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real measurements are not at hand")
 def test_a_real_detector_is_no_plain_poisson_process_but_nearly_one(tmp_path: Path) -> None:
     """It fails at short intervals; the shape beyond 0.5 us, of its own counts, is that of a Poisson process."""

@@ -199,6 +199,7 @@ def test_a_home_and_what_is_asked_for_come_first(copied: Path, tmp_path: Path) -
     assert Path(where(copied, HOME=str(home), NUMBA_CACHE_DIR=str(asked))[0]).parent == asked
 
 
+@pytest.mark.slow
 def test_a_change_in_any_file_makes_another_folder(copied: Path, tmp_path: Path) -> None:
     """A kernel that calls one of another file would else be the old one."""
     before, _ = where(copied, NUMBA_CACHE_DIR=str(tmp_path / "asked"))

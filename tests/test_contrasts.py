@@ -46,6 +46,7 @@ def test_the_courses_are_orthonormal_and_have_no_mean() -> None:
         assert np.all(np.diff(np.abs(np.diff(courses[0]))) < 1e-12)  # a rise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("swing", "replicates"), [(0.0, 32), (0.7, 32), (4.0, 32), (4.0, 96)], ids=["steady", "a little", "much", "with 96"]
 )
@@ -112,6 +113,7 @@ def test_a_drift_that_no_capture_shows_is_found_in_all_together() -> None:
     assert all(check.words == ", alike in 5 captures" for check, _ in found if check.p < 1e-4 and len(check.cells) == 5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swing", [0.0, 4.0], ids=["steady", "fluctuating"])
 def test_right_models_pass_together(swing: float) -> None:
     """False-alarm rate 1e-6."""

@@ -230,6 +230,7 @@ def waves(
     return bench_of((sensor(0.2), measurement.in_memory("lab", layout, list(data))), 16), depth
 
 
+@pytest.mark.slow
 def test_a_map_is_fitted_by_the_statistic_that_a_user_declares(tmp_path) -> None:
     """Counts say nothing of it. The fall and the rise of a pixel do, by the binomial law of its two halves."""
     replicates, depth = waves(tmp_path)

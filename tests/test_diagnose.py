@@ -69,6 +69,7 @@ def test_a_right_model_is_adequate():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_short_gate_is_found_by_its_trace_in_the_dark():
     found, truth = found_in("open-qis-gate")
     assert found.verdict == "explained"

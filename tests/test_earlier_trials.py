@@ -16,6 +16,7 @@ from spadmnist.inference.signature import Signature
 DELAY = "crosstalk", "delay"
 
 
+@pytest.mark.slow
 def test_another_number_of_the_same_effect_is_simulated_anew() -> None:
     """More crosstalk at a delay of 0.1 ns is no more of what the data have, which is at 40 ns."""
     listed = sp.effects.Crosstalk(probability=0.05, delay=1e-10)

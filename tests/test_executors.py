@@ -193,6 +193,7 @@ def test_workers_that_cannot_start_are_not_blamed_on_memory(monkeypatch: pytest.
         Loky(2).run(square, iter, range(4), lambda key, result: None)
 
 
+@pytest.mark.slow
 def test_a_task_that_ends_its_worker_is_not_blamed_on_memory() -> None:
     with pytest.raises(SpadError, match=r"each time it made 2 \(ended by itself with status 3\); all else is complete"):
         Loky(2).run(leave_at_two, iter, range(4), lambda key, result: None)

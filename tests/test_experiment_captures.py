@@ -260,6 +260,7 @@ def test_a_lab_of_other_pixels(small: Path) -> None:
 # --- whole runs ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @with_torch
 def test_a_run_and_one_on_captures(small: Path) -> None:
     done = experiments.run(Captures(), Setting(small / "out"))

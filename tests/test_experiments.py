@@ -318,6 +318,7 @@ def test_the_config_of_the_experiment_is_shipped() -> None:
 # --- by the command line ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_lists_and_describes() -> None:
     listed, page = command("experiment"), command("experiment", "accuracy")
     assert listed.returncode == page.returncode == 0 and listed.stderr == page.stderr == ""

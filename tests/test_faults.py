@@ -67,6 +67,7 @@ def test_a_sample_of_tries_loses_nothing(classes: tuple[str, ...], sample: int) 
     assert done.returncode == 0, done.stderr[-2000:] + done.stdout[-6000:]
 
 
+@pytest.mark.slow
 def test_where_nothing_is_wrong_nothing_is_lost(tmp_path: Path) -> None:
     done = harness("run", "killed export npy", "full export npy", "--jobs", 1, "-o", tmp_path / "faults.md")
     assert done.returncode == 0, done.stderr + done.stdout
@@ -93,6 +94,7 @@ def test_a_planted_fault_is_told(planted: str, what: str, says: str) -> None:
     assert told == f'- `python scripts/faults.py run --seed 1 "{what}" ' and says in done.stdout
 
 
+@pytest.mark.slow
 def test_a_class_that_is_not_there() -> None:
     done = harness("run", "killed nothing")
     assert done.returncode == 2 and "no class is called so" in done.stderr

@@ -88,6 +88,7 @@ def measured(tmp_path, sensor, captures):
     return measurements.open(measurements.write(tmp_path / "data", "made", sensor.layout, iter(recordings), plans))
 
 
+@pytest.mark.slow
 def test_a_dead_time_is_fitted_and_a_map_found(tmp_path, made):
     sensor, captures, map_ = made
     data = measured(tmp_path, sensor, captures)

@@ -105,6 +105,7 @@ def test_what_fluctuates_is_judged_by_how_wide_it_is() -> None:
     assert log_likelihood_ratio(quiet_now, quiet_there, trace) == pytest.approx(9 * (8 / 9 - 2 * math.log(3)))
 
 
+@pytest.mark.slow
 def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> None:
     """Its coherence time is the exposure: most that one recording has of it is another total, which no trace has."""
     noise = "    source_noise: {contrast: 0.2, coherence_time: 40 ms}\n"
@@ -125,6 +126,7 @@ def test_a_lamp_that_drifts_about_for_long_is_judged_by_its_totals_too(lab) -> N
     assert one.fluctuates
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contrast", [0.2, 0.0])
 def test_a_lamp_is_missed_where_it_made_the_totals_wider(lab, contrast: float) -> None:
     """Beside later steps: judged by how wide it makes them itself, nothing would ever be missed without it."""

@@ -362,6 +362,7 @@ def test_hot_pixels_leave_the_others_to_be_seen() -> None:
     assert pictures.white_of(Layout(1, 1, 1, 1, np.zeros((1, 2))), np.array([3.0])) == (3.0, 0)
 
 
+@pytest.mark.slow
 def test_the_sheet_has_a_row_a_capture_and_a_column_a_method(lab: measurement.Measurement, tmp_path: Path) -> None:
     def size(methods: list[str]) -> tuple[int, int]:
         with Image.open(io.BytesIO(fluxes.sheet(fluxes.of_measurement(lab, methods)))) as image:
@@ -474,6 +475,7 @@ def test_frames_that_came_from_elsewhere(tmp_path: Path) -> None:
     assert found.dtype == np.float32 and np.array_equal(found, right) and found.sum() == 176
 
 
+@pytest.mark.slow
 def test_a_part_of_the_sensor_gives_its_own_numbers(tmp_path: Path) -> None:
     """A measured window of a chip whose PDP differs from pixel to pixel: the nominal values of the window."""
     sensor = tmp_path / "chip.yaml"

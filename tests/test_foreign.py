@@ -234,6 +234,7 @@ def test_files_of_a_dataset_nested_too_deeply(depth: int, tmp_path: Path) -> Non
             path.write_bytes(before)
 
 
+@pytest.mark.slow
 def test_mistakes_without_end(tmp_path: Path) -> None:
     """A file of a hundred thousand wrong entries is answered in a screen of lines, and by no endless line."""
     file = tmp_path / "a.yaml"

@@ -205,6 +205,7 @@ def test_a_counter_that_began_anew_is_refused(tmp_path: Path, bits: int, grouped
     assert back(run(tmp_path / "whole.npz", Said(exposure=exposure))).totals.sum() == 2000
 
 
+@pytest.mark.slow
 def test_times_in_any_order_are_no_counter(tmp_path: Path) -> None:
     """Shuffled, or pixel after pixel: they fill 2^16 ticks and are sorted, as ever."""
     rng = np.random.default_rng(5)

@@ -209,6 +209,7 @@ def test_a_plan_keeps_its_line_ends_and_positions(tmp_path: Path) -> None:
     assert measurement.open(lab).recording("dark").layout.positions is not None
 
 
+@pytest.mark.slow
 def test_the_verb(tmp_path: Path) -> None:
     lab = plan(tmp_path / "my lab", PLAN[: PLAN.index("  - id: counts")])
     save(tmp_path / "a.npy", bits())
@@ -224,6 +225,7 @@ def test_the_verb(tmp_path: Path) -> None:
     assert measurement.open(lab).missing == ()
 
 
+@pytest.mark.slow
 def test_a_plan_is_inspected_as_far_as_it_is_recorded(tmp_path: Path) -> None:
     lab = plan(tmp_path / "lab")
     fill(save(tmp_path / "dark.npy", bits()), lab)

@@ -136,13 +136,13 @@ STAGES: dict[str, tuple[Any, str, bool]] = {
 SIMULATED_BEFORE = ("accepting", "all together")  # for its evidence: then it is a step, with the values fitted before
 
 
-def one_in_four(stages: Iterable[str]) -> list[Any]:
+def one_in_six(stages: Iterable[str]) -> list[Any]:
     """The stages, the others `long`: each is a diagnosis, and all take the same way out."""
-    return [pytest.param(stage, marks=pytest.mark.long if k % 4 else ()) for k, stage in enumerate(stages)]
+    return [pytest.param(stage, marks=pytest.mark.long if k % 6 else ()) for k, stage in enumerate(stages)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", one_in_four(STAGES))
+@pytest.mark.parametrize("stage", one_in_six(STAGES))
 def test_a_diagnosis_goes_on_without_it(stage: str, lab, monkeypatch, tmp_path) -> None:
     """Afterpulsing is what lacks; at one stage it cannot be simulated any more."""
     sensor, data = lab(f"    {_AFTER}")
@@ -183,7 +183,7 @@ FAILING: dict[str, tuple[Any, str, bool]] = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", one_in_four(FAILING))
+@pytest.mark.parametrize("stage", one_in_six(FAILING))
 def test_an_answer_is_given_whatever_is_raised_beside_the_steps(stage: str, lab, monkeypatch) -> None:
     """found: is the step that lacks found all the same? What is raised while the best is chosen is laid to that one."""
     sensor, data = lab(f"    {_AFTER}")
@@ -286,6 +286,7 @@ def test_what_cannot_be_fitted_as_a_step_is_tried_once(monkeypatch) -> None:
     assert any(e["effect"] == "detection" and "no level" in e["why"] for e in path.scan.untried)
 
 
+@pytest.mark.slow
 def test_what_a_later_model_can_do_was_not_left_out(lab, monkeypatch) -> None:
     """A candidate whose first look fails is looked at again under the next model, and stands in `not_tried` no more."""
     path = begin(bench_of(lab(), 8))

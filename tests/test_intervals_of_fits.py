@@ -150,6 +150,7 @@ def test_a_map_of_a_rate_that_is_listed_at_0_is_fitted() -> None:
     assert np.corrcoef(found, hidden.effect("dark_counts").rate)[0, 1] > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modality", ["qis", "counts"])
 def test_an_exposure_is_no_light_level(modality: str) -> None:
     """Frames 10 % longer, half of whose detections are dark counts, or whose dead time is long."""

@@ -199,6 +199,7 @@ print(peak - before)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of a process is read from /proc")
 def test_large_images_take_little_memory(tmp_path: Path) -> None:
     """Of 100 MB of images at most 40 MB lie in memory at any time, where 17 MB are held whole."""

@@ -142,6 +142,7 @@ def test_a_stream_that_begins_anew_in_each_part_is_noticed(monkeypatch: pytest.M
         _same(exposed(sensor, SUMMED, ALL, most=2500.0), whole, "parts")
 
 
+@pytest.mark.slow
 def test_an_effect_that_does_not_count_on_is_told_by_the_contract() -> None:
     class Careless(Effect, stage="timing"):
         """Moves stamps, by numbers that begin anew in each part.

@@ -114,6 +114,7 @@ def test_dead_time_and_afterpulsing_are_covered(sensor: Sensor) -> None:
         check(answers, key, truth)
 
 
+@pytest.mark.slow
 def test_a_rate_is_covered_with_its_light(sensor: Sensor) -> None:
     truth = 3000.0
     hidden = with_values(sensor, {RATE: truth, CHANCE: 0.0})

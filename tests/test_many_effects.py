@@ -96,6 +96,7 @@ def test_columns_of_another_model_do_not_end_a_fit(lab) -> None:
     assert path.values[CROSSTALK] == pytest.approx(0.03, rel=0.3)
 
 
+@pytest.mark.slow
 def test_only_what_explains_the_same_is_fitted_beside_each_other(lab) -> None:
     """A dead time and a slow recovery compete for one edge; neighbours that trigger each other have nothing to do
     with it, and are found by the next step."""
@@ -211,6 +212,7 @@ def test_signatures_of_the_first_look_are_used_again(lab) -> None:
     assert has_changed(path.scan, path.evaluation, known)
 
 
+@pytest.mark.slow
 def test_a_periodic_signature_is_simulated_once_for_a_line(lab) -> None:
     replicates = bench_of(lab(FLICKER, light=400), 16)
     look, evaluation = quiet(replicates), evaluate(replicates, {})

@@ -131,6 +131,7 @@ def test_a_look_counts_what_is_odd(lab: Path) -> None:
     assert (row["hot_pixels"], row["dead_pixels"], row["empty_pixels"]) == (1, 1, 1)
 
 
+@pytest.mark.slow
 def test_inspect_prints_and_draws(lab: Path, tmp_path: Path) -> None:
     png = tmp_path / "sheet.png"
     result = CliRunner().invoke(cli, ["inspect", str(lab), "--plot", str(png)])

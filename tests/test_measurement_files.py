@@ -195,6 +195,7 @@ def test_names_in_a_file_cannot_write_to_the_terminal(tmp_path: Path) -> None:
     assert "\x1b" not in text
 
 
+@pytest.mark.slow
 def test_damaged_files_end_in_a_sentence(tmp_path: Path) -> None:
     """Cut short anywhere, or with changed bytes: an InputError or data, and never another error or an endless loop."""
     described(tmp_path, TR)

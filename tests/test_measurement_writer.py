@@ -200,6 +200,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
     assert int(done.stdout) < 100e6 < 131e6 < (tmp_path / "out" / "noise.h5").stat().st_size, done.stderr
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
     """HDF5 crashes where a write fails: it is not told of it."""
     done = alone(f"""
@@ -217,6 +218,7 @@ for n, limit in enumerate((10, 3000, 100_000, 5_000_000, 32_000_000)):
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
+@pytest.mark.slow
 def test_a_full_disk(tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -248,6 +250,7 @@ write({str(tmp_path / "out")!r}, at=lambda start: start > 2000 and os.kill(os.ge
     assert tree(tmp_path / "out") == tree(tmp_path / "whole") and len(tree(tmp_path / "out")) == 2
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_the_writing(tmp_path: Path) -> None:
     """It comes while HDF5 packs a piece, and calls back; most of the frames are then never read."""
     done = alone(f"""

@@ -36,6 +36,7 @@ from spadmnist.inference.spectral_lines import Line
 from spadmnist.inference.trial import Trial, weaker
 
 
+@pytest.mark.slow
 def test_a_closer_look_only_adds_recordings(lab):
     """And so it is the same as if they had been made at once; half of the work."""
     replicates = bench_of(lab(), 16)
@@ -425,6 +426,7 @@ def test_what_counts_and_what_sets_beside_each_other_is_told_apart(lab) -> None:
         assert low <= share_of_counts(replicates, evaluation, signature) <= high, name
 
 
+@pytest.mark.slow
 def test_a_faint_step_must_help_along_its_own_trace(lab, monkeypatch) -> None:
     """Settled by chance at twice its strength and more, or with the other sign, it does not."""
     replicates = bench_of(lab())

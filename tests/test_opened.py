@@ -139,6 +139,7 @@ def test_what_is_said(tmp_path: Path) -> None:
         assert file.read() == b"abc"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["/dev/stdin", "/dev/fd/0", "/proc/self/fd/0"])
 def test_what_is_handed_over_open_may_be_a_pipe(place: str, tmp_path: Path) -> None:
     if not os.path.exists("/".join(place.split("/")[:-1])):

@@ -213,6 +213,7 @@ def failing_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Comparison, 
 # --- what it says ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_failing_model_is_told_first_with_the_numbers_that_matter(failing_page: tuple[Comparison, str]) -> None:
     found, text = failing_page
     parts = Parts(text)
@@ -420,6 +421,7 @@ def test_an_axis_that_is_no_axis_is_not_used() -> None:
     assert falling is not None
 
 
+@pytest.mark.slow
 def test_numbers_beyond_all_bounds_are_drawn() -> None:
     for kind in ("rows", "names", "map", "intervals"):
         check = check_of(kind, 1e-9)
@@ -483,6 +485,7 @@ def test_many_lights_are_a_picture_of_the_oddest(tmp_path: Path) -> None:
 # --- the file -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_it_is_one_small_file_and_always_the_same(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
     found, before = failing_page
     path = pages.comparison(found, tmp_path / "deep" / "report")
@@ -655,6 +658,7 @@ def near(picture: np.ndarray, colour: str, by: int = 6) -> np.ndarray:
     return (np.abs(picture.astype(int) - wanted) <= by).all(axis=2)
 
 
+@pytest.mark.slow
 @needs_a_browser
 def test_a_browser_shows_words_and_pictures(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
     page = tmp_path / "index.html"
@@ -682,6 +686,7 @@ def framed(page: Path, folder: Path, width: int, height: int) -> np.ndarray:
     return screenshot(outer, folder, height, 600)[:, :width]
 
 
+@pytest.mark.slow
 @needs_a_browser
 def test_four_hundred_points_are_wide_enough(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
     page = tmp_path / "index.html"
@@ -701,6 +706,7 @@ def is_wide_enough(page: Path, tmp_path: Path) -> None:
     assert not (near(wider, "#fafaf8") | near(wider, "#ffffff"))[:, -8:].all()
 
 
+@pytest.mark.slow
 @needs_a_browser
 def test_it_is_dark_where_the_reader_wants_it(tmp_path: Path, failing_page: tuple[Comparison, str]) -> None:
     page = tmp_path / "index.html"
@@ -749,6 +755,7 @@ def visits() -> Iterator[tuple[int, list[bytes]]]:
         thread.join()
 
 
+@pytest.mark.slow
 @needs_a_browser
 def test_nothing_is_asked_for_and_nothing_runs(tmp_path: Path, visits: tuple[int, list[bytes]]) -> None:
     port, asked = visits

@@ -297,6 +297,7 @@ def test_a_misfit_that_rises_does_not_fall(tmp_path: Path) -> None:
     assert "The misfit on held-out data went from 61.2 to 70" in parts.text
 
 
+@pytest.mark.slow
 def test_where_the_totals_alone_were_wrong_their_error_falls(tmp_path: Path) -> None:
     ladder = [rung("start", 1.01), rung("+ background_light", 1.03)]
     ladder[0]["errors"] |= {"linearity": 0.0142, "map": 0.002}
@@ -311,6 +312,7 @@ def test_where_the_totals_alone_were_wrong_their_error_falls(tmp_path: Path) -> 
     assert "totals:" not in parts.text and "It was as low before: a mean over everything hardly" in parts.text
 
 
+@pytest.mark.slow
 def test_what_would_look_the_same_is_said(tmp_path: Path) -> None:
     said = "But: a dead time that differs from event to event"
     for name, there in (("jitter", True), ("crosstalk", False)):
@@ -448,6 +450,7 @@ def test_it_is_one_small_file_and_always_the_same(tmp_path: Path, full_page: str
     assert len(Parts(full_page).images) == 2 + 3  # the ladder, broad and narrow, and the checks
 
 
+@pytest.mark.slow
 def test_other_peoples_files_stay(tmp_path: Path) -> None:
     (tmp_path / "sensor.yaml").write_text("mine")
     (tmp_path / "index.html").write_text("of a comparison")
@@ -496,6 +499,7 @@ def test_figures_have_names(tmp_path: Path) -> None:
         Fit(answer_of(**BARE | {"ladder": []}), fit.start).figure("ladder")
 
 
+@pytest.mark.slow
 def test_what_is_nearest_to_what_remains_is_named(tmp_path: Path) -> None:
     _, parts = written(answer_of(), tmp_path)
     assert "Nearest, but" not in parts.text
@@ -571,6 +575,7 @@ def test_the_page_forbids_everything_else(full_page: str) -> None:
 # --- in a browser ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @needs_a_browser
 def test_a_browser_shows_the_ladder_beside_its_table_and_on_a_telephone_above_it(
     tmp_path: Path, full_page: str
@@ -593,6 +598,7 @@ def test_a_browser_shows_the_ladder_beside_its_table_and_on_a_telephone_above_it
     assert not placed[500][0] and placed[500][1] > 0.4  # below
 
 
+@pytest.mark.slow
 @needs_a_browser
 def test_the_page_fits_on_a_telephone_and_is_dark_where_the_reader_wants_it(tmp_path: Path, full_page: str) -> None:
     page = tmp_path / "report.html"

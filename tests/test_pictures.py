@@ -121,6 +121,7 @@ def test_inspect_finds_the_places_of_a_dataset(tmp_path: Path) -> None:
     assert sizes["c"][1] > sizes["grid"][1] + 50
 
 
+@pytest.mark.slow
 def test_names_are_drawn_as_what_can_be_seen_of_them(tmp_path: Path) -> None:
     """ESC, the end of a line and a mark of direction as their numbers, and no $ begins a formula."""
     layout, offsets = Layout(1, 2, np.nan, np.nan), np.array([0, 2, 3])

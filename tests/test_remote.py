@@ -304,6 +304,7 @@ def test_what_is_wrong_on_a_server_is_one_sentence(
         _ = spadmnist.open(f"{site.url}/out")[LEVEL, "train"].images[0]
 
 
+@pytest.mark.slow
 def test_no_manifest_and_no_host_end_with_status_2(site: Site) -> None:
     for address, words in (
         (f"{site.url}/nothing", "there is no manifest.json"),
@@ -484,6 +485,7 @@ def test_fetch_leaves_what_is_there_alone(site: Site, out: Path, tmp_path: Path)
     assert (tmp_path / "got" / "mine").read_text() == "mine" and not site.asked
 
 
+@pytest.mark.slow
 def test_inspect_shows_what_a_zip_and_an_address_hold(site: Site, out: Path, tmp_path: Path) -> None:
     made = shutil.make_archive(str(tmp_path / "packed"), "zip", out)
     here = run("inspect", str(out))

@@ -120,6 +120,7 @@ def test_half_of_the_light_is_seen_all_the_same(which: str) -> None:
     assert comparison.compare(model, data, 0, None, 1, 48).verdict == "fails"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [7.0, 12.0, 20.0])
 def test_first_stamps_of_every_frame_give_a_free_light_level(number: float) -> None:
     """Their number is that of the frames at any such level; how early they come says which.
@@ -240,6 +241,7 @@ def test_stamps_beside_a_counter_are_those_that_are_recorded_alone() -> None:
     assert np.array_equal(alone.tr.offsets, both.tr.offsets)
 
 
+@pytest.mark.slow
 def test_nothing_fires_between_the_frames_of_a_counter() -> None:
     """Half the frame's traps release in the gap, and what would fall into the gap fills none (physics, `device`)."""
     traps = sp.effects.SlowAfterpulsing(probability=0.05, lifetime=2 * FRAME)
@@ -428,6 +430,7 @@ def test_a_small_dark_total_is_not_excused_by_its_own_scatter() -> None:
     assert [(c.statistic, c.capture) for c in found.failing] == [("rate", "d0")]
 
 
+@pytest.mark.slow
 def test_a_right_model_whose_pixels_blink_is_adequate() -> None:
     """Its totals scatter far more than counts; no other dark rate is the reason."""
     blinking = sp.effects.BlinkingDarkCounts(amplitude=2000.0, rate_on=0.2, rate_off=0.2, fraction=0.05)

@@ -54,6 +54,7 @@ CELL, OTHER = ("flat", "a"), ("flat", "b")
 # --- signs -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_small_number_that_is_listed_wrong_has_a_signature() -> None:
     """Crosstalk of 0.2 % that is 0.6 %: a tenth more of it, which is tried first, is nothing among noise."""
     listed = sp.effects.Crosstalk(probability=2e-3, delay=1e-9)
@@ -63,6 +64,7 @@ def test_a_small_number_that_is_listed_wrong_has_a_signature() -> None:
     assert best.fall > 25 and best.scaled()["crosstalk", "probability"] == pytest.approx(6e-3, rel=0.4)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_tried_stronger_stays_as_it_was() -> None:
     """Near the end of its range, and without a signature in so few data."""
     listed = sp.effects.Crosstalk(probability=0.04, delay=1e-9)
@@ -377,6 +379,7 @@ def test_the_best_candidate_has_the_most_evidence(lab) -> None:
     assert within(10.0, more, replace(rows, evidence=94.0)) is more
 
 
+@pytest.mark.slow
 def test_a_light_that_fluctuates_makes_squares_fall_and_has_no_evidence(lab) -> None:
     """The data are those of a steady light, which each of the fluctuating ones surrounds at some distance."""
     replicates = bench_of(lab(light=900, side=4), 32)
@@ -686,6 +689,7 @@ def test_a_time_is_tried_short_and_long(lab) -> None:
     assert 0 < crosstalk < 1
 
 
+@pytest.mark.slow
 def test_an_edge_that_is_thought_to_be_far_off_is_tried_where_it_was_seen_too(lab) -> None:
     """What moves an edge does not grow in proportion: a line search may lead to where nothing of it is left."""
     sensor, data = lab("    slow_recovery: {time_constant: 5 ns}\n", light=900, side=4)

@@ -311,6 +311,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPADMNIST_CACHE", str(tmp_path / "cache"))
 
 
+@pytest.mark.slow
 def test_a_right_model_of_a_scene_is_adequate_and_another_scene_is_not(tmp_path: Path) -> None:
     """A model is called wrong in 1 % of comparisons; the seed is fixed."""
     sensor, seen = large()
@@ -370,6 +371,7 @@ def dataset_of(folder: Path, source: str) -> tuple[Any, Path]:
     return experiment, folder / "out"
 
 
+@pytest.mark.slow
 def test_a_dataset_of_a_chart_is_a_measurement_of_its_scene(tmp_path: Path) -> None:
     digits = "{source: digits, train: 9, test: 9, rows: 9, columns: 9}"
     experiment, root = dataset_of(tmp_path, f"chart, of: {digits}, count: 4, repetitions: 2")

@@ -77,6 +77,7 @@ def texts() -> Iterator[tuple[str, str]]:
                 yield f"{path.name}:{node.lineno}", node.value
 
 
+@pytest.mark.slow
 def test_every_good_config_of_the_tests_keeps_it(tmp_path: Path) -> None:
     good = 0
     for place, text in texts():

@@ -54,6 +54,7 @@ def p_of(evaluation: Any, tried: list[Any]) -> float:
     return trials_corrected(own, min(data))
 
 
+@pytest.mark.slow
 def test_p_values_of_many_candidates_are_no_smaller_than_uniform_and_not_far_larger() -> None:
     """Of cells that scatter together and few recordings. More than so many below 0.05 and 0.01 once in a million.
 

@@ -42,6 +42,7 @@ def cosine(looked: tuple[Replicates, Evaluation, list[Trial], list[Trial]], one:
     return float(a @ b) / math.sqrt(float(a @ a) * float(b @ b))
 
 
+@pytest.mark.slow
 def test_they_lie_between_the_templates_and_are_nearer_to_the_truth(looked) -> None:
     _, _, tried, found = looked
     scanned = [t for t in tried if t.candidate.name == "add afterpulsing"]

@@ -122,6 +122,7 @@ def test_a_capture_too_short_for_blocks_has_no_halves() -> None:
     assert stamps(1e-9, 1e-10, n=5).every_other(False) is None
 
 
+@pytest.mark.slow
 def test_the_halves_of_a_right_model_are_as_wide_as_its_own(lab) -> None:
     """Every cell of both halves, beside the model that made the data; false alarm 1e-6 by Holm over all checks."""
     replicates = bench_of(lab(side=4), 32)
@@ -243,6 +244,7 @@ def test_a_placebo_is_as_strong_in_halves_as_in_the_whole(lab) -> None:
     assert idle is not None and idle.placebo == {} and idle.row["placebo"]
 
 
+@pytest.mark.slow
 def test_the_ladder_of_a_number_that_one_capture_tells(lab) -> None:
     path = begin(bench_of(lab("    crosstalk: {probability: 3 %}\n", side=4)))
     taken(path, "add crosstalk", {CROSSTALK: 0.03})

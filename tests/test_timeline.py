@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 import timeline
 
@@ -32,6 +34,7 @@ def test_a_spans_own_time_is_without_those_within_it() -> None:
     assert spans.taken() == []
 
 
+@pytest.mark.slow
 def test_a_run_is_watched_from_its_start_to_its_end(tmp_path: Path) -> None:
     """In a process of its own, which is wrapped: with threads, the shortest way through all of it."""
     out = tmp_path / "profile"

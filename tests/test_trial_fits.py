@@ -289,6 +289,7 @@ def test_a_stated_whole_number_is_tried_at_other_whole_numbers(lab, stated: int,
     assert all(coordinate.scaled(tried[-1], x) == round(coordinate.scaled(tried[-1], x)) for x in (0.2, 0.7, 1.6))
 
 
+@pytest.mark.slow
 def test_a_stated_queue_that_is_another_one_is_found(lab) -> None:
     """It has no slope, and there is no other number beside it."""
     sensor, data = lab("    readout_loss: {service_time: 100 ns, queue: 2}\n", light=1000)

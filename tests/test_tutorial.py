@@ -26,6 +26,7 @@ def run(folder: Path, line: str, status: int = 0) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.long  # an own effect: test_plugins_in_one_file; what no effect describes: test_strangers
 def test_the_loop_of_the_docs(tmp_path):
     text = (ROOT / "docs" / "start" / "loop.md").read_text()
     blocks = re.findall(r"```(\w*)\n(.*?)```", text, re.S)

@@ -23,7 +23,8 @@ def sensor(*more: sp.effects.Effect) -> sp.Sensor:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("listed", [pytest.param(True, marks=pytest.mark.long), False])
+@pytest.mark.long
+@pytest.mark.parametrize("listed", [True, False])
 def test_crosstalk_that_reaches_far_is_found_with_its_reach(listed: bool) -> None:
     """1 % in a neighbour, and 0.2 % / d to six pitches; to a bare sensor a near crosstalk is added first."""
     far = sensor(sp.effects.Crosstalk(**NEAR, reach=6.0, far_ratio=0.2))

@@ -241,6 +241,7 @@ def semaphores(folder: Path) -> list[Path]:
     return list(MEMORY.glob(f"sem.*-{folder.name}-*"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not MEMORY.is_dir(), reason="semaphores are no files here")
 def test_the_next_run_removes_what_a_killed_one_left_and_nothing_of_a_living_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -159,6 +159,7 @@ def test_crosstalk_at_its_bounds() -> None:
     assert len(crosstalk_of(alone, probability=0.5).spawn(events_of(alone, 9, 1), draws).parent) == 0
 
 
+@pytest.mark.slow
 def test_what_an_image_spawns_depends_on_its_number_alone() -> None:
     effects: list[Any] = [
         crosstalk_of(GRID, probability=0.2),
@@ -800,8 +801,14 @@ def case_of(name: str, flux: str) -> Case:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flux", FLUXES)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    ("name", "flux"),
+    [  # each case and each flux; `long`: each case at each flux
+        pytest.param(name, flux, marks=pytest.mark.long if (n + k) % len(FLUXES) else ())
+        for n, name in enumerate(CASES)
+        for k, flux in enumerate(FLUXES)
+    ],
+)
 def test_a_device_is_the_event_queue(name: str, flux: str) -> None:
     case = case_of(name, flux)
     images = {"low": 4000, "medium": 1500, "high": 600}[flux]

@@ -401,6 +401,7 @@ def measured_widths(file: Path) -> np.ndarray:
     return np.diff(ends[ends[:, -1] > 2499], axis=1, prepend=0.0) / (TICK * 1e12)  # one pixel had hardly any data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", ["TDC_B7d_#28_2212b.csv", "TDC_NL11_#21_2212b.csv", "TDC_NL11_#33_2212b.csv"])
 def test_measured_codes_of_a_board(board: str, tmp_path: Path) -> None:
     """Uniform light shows each pixel's measured code density; a converter with equal codes is far from it."""

@@ -145,6 +145,7 @@ def blind(recording: Recording, size: int, dead: float) -> Recording:
     return tr_of([(np.array(k) + 0.5) * tick for k in kept], recording.layout, recording.conditions.exposure, tick)
 
 
+@pytest.mark.slow
 def test_a_shared_converter_is_found_in_its_blocks_alone() -> None:
     """Four pixels to a converter of 7 ns: no pair is nearer in the blocks, and pairs across blocks are as by chance."""
     recording = blind(tr(6, LINE, 2e6, 1e-3), 4, 7e-9)
