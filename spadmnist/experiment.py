@@ -234,12 +234,12 @@ class Experiment:
 
     @cached_property
     def _frames_alone(self) -> bool:
-        """Is there nothing but binary frames that stand alone?"""
+        """Is there nothing but binary frames that stand alone and are live whole?"""
         c = self.conditions
         if set(self.readouts) != {"qis"} or self.sensor.layout.columns * c.frames > _MOST_OF_A_ROW:
             return False
         half = max(1, c.frames // 2)
-        return standing.tying(self.sensor, c, replace(c, frames=half, exposure=half * c.frame_period)) is None
+        return standing.by_bits(self.sensor, c, replace(c, frames=half, exposure=half * c.frame_period))
 
     def from_frames(self, photons: np.ndarray) -> np.ndarray:
         """(images,) bool: which images hold so many events that their frames are drawn without them?

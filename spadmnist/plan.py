@@ -85,10 +85,14 @@ def _some_of(array: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _seen(experiment: Experiment, photons: np.ndarray) -> np.ndarray:
-    """Expected entries of the stream per pixel: TR detections or, without TR, frames with a detection."""
-    candidates, recorded = experiment.sensor.expected(experiment.seen(photons), experiment.conditions)
-    frames = experiment.conditions.frames
-    return recorded if "tr" in experiment.readouts else -frames * np.expm1(-candidates / frames)
+    """Expected entries of the stream per pixel: detections of TR, else of a counter, else frames with a detection."""
+    sensor, c, light = experiment.sensor, experiment.conditions, experiment.seen(photons)
+    if "tr" in experiment.readouts:
+        return sensor.expected(light, c)[1]
+    if c.counting == "counter" and set(experiment.readouts) == {"counts"}:
+        counted = sensor.expected(light, c.within_frames, stamped=False)[1]
+        return np.minimum(counted, c.count_frames * sensor.full_counts(c))
+    return -c.frames * np.expm1(-sensor.expected(light, c.within_frames, first=True)[0] / c.frames)
 
 
 def _uniform(experiment: Experiment) -> bool:

@@ -345,6 +345,8 @@ class Sensor:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`.
 
+        Where the dead time is no shorter than a gate is open, the detections are rough.
+
         stamped: time stamps are recorded, of which a readout may lose some; otherwise each pixel counts for itself.
         first: of each frame the first detection alone is recorded; under `rules: device` it alone reaches other pixels.
         """
@@ -355,15 +357,20 @@ class Sensor:
             there = self.chip.expected(self.window.spread(photons), conditions, stamped, first)
             return there[0][:, self.window.pixels], there[1][:, self.window.pixels]
         rate, light = self.rates(photons, conditions)
-        dark = rate - light
+        parts = {"light": light, "dark": rate - light, "own": np.zeros_like(rate)}
         for effect in self.at("arrival"):
-            if effect.acts_on == "light":
-                light = hooks.expected(effect, light, conditions)
-            else:
-                dark = hooks.expected(effect, dark, conditions)
-        rate = light + dark if self.at("arrival") else rate
+            parts[effect.acts_on] = hooks.expected(effect, parts[effect.acts_on], conditions)
+        rate = sum(parts.values()) if self.at("arrival") else rate
+        on_average = rate
         for effect in self.at("gate"):
-            rate = hooks.expected(effect, rate, conditions)
+            on_average = hooks.expected(effect, on_average, conditions)
+        # Where all detections count, the dead time is that at the rate while the gate is open. Of a frame that records
+        # its first event alone, the number of events in it counts.
+        opened: Any = 1.0
+        if first:
+            rate = on_average
+        elif on_average is not rate:
+            opened = np.divide(on_average, rate, out=np.ones_like(rate), where=rate > 0)
         for effect in self.at("correlated"):
             if self.rules == "device" and 0 < effect.influence() < math.inf:
                 rate = rate + self._reached(effect, rate, conditions, first)
@@ -373,7 +380,7 @@ class Sensor:
         for stage in ("dead_time", "timing", "readout") if stamped else ("dead_time",):
             for effect in self.at(stage):
                 rate = hooks.expected(effect, rate, conditions)
-        return candidates * conditions.live_time, rate * conditions.live_time
+        return candidates * opened * conditions.live_time, rate * opened * conditions.live_time
 
     def _reached(self, effect: Effect, rate: np.ndarray, conditions: Conditions, first: bool) -> np.ndarray:
         """What an effect causes in other pixels where recorded detections cause it alone, and these do, too; 1/s."""

@@ -42,6 +42,16 @@ def tying(sensor: Sensor, conditions: Conditions, part: Conditions) -> str | Non
     return next((e.name for e in gates if not np.array_equal(e.open(within, part), e.open(times, conditions))), None)
 
 
+def by_bits(sensor: Sensor, conditions: Conditions, part: Conditions) -> bool:
+    """Whether the bits of frames may be drawn without their events: nothing ties the frames, and each is live whole.
+
+    Args:
+        conditions: of all frames.
+        part: of a stretch of them.
+    """
+    return not sensor.at("gate") and tying(sensor, conditions, part) is None
+
+
 def bits(
     sensor: Sensor, conditions: Conditions, photons: np.ndarray, streams: Streams
 ) -> Iterator[tuple[int, np.ndarray]]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import bit_planes, light, recording, standing, units
+from .effects import Conditions
 from .errors import InputError
 from .events import Layout
 from .measurement import Measurement, write
@@ -98,13 +99,12 @@ def _recording(sensor: Sensor, made: Recorded, image: int, capture: Capture) -> 
 
 def draws_bits(sensor: Sensor, capture: Capture, frames: int = 1) -> bool:
     """Whether the bits of a capture's frames may be drawn without their events; frames: of a stretch of them."""
-    return capture.modality == "qis" and not sensor.at("gate") and _stand_alone(sensor, capture, frames)
+    return capture.modality == "qis" and standing.by_bits(sensor, capture.conditions, _stretch(capture, frames))
 
 
-def _stand_alone(sensor: Sensor, capture: Capture, frames: int) -> bool:
-    """Whether stretches of so many frames may be simulated by themselves."""
-    c = capture.conditions
-    return standing.tying(sensor, c, replace(c, frames=frames, exposure=frames * c.frame_period)) is None
+def _stretch(capture: Capture, frames: int) -> Conditions:
+    """The conditions of so many of a capture's frames."""
+    return replace(capture.conditions, frames=frames, exposure=frames * capture.conditions.frame_period)
 
 
 _Told = Callable[[float], None]  # which share is made
@@ -118,7 +118,7 @@ def _in_parts(sensor: Sensor, capture: Capture, events: float) -> _Part | None:
     frames = max(1, int(c.frames // each * _AT_ONCE / max(events, 1.0) / 2)) * each
     if draws_bits(sensor, capture, frames):
         return lambda flux, streams, told: _by_bits(sensor, capture, flux, streams, told)
-    if capture.modality == "tr" or events > _MOST or not _stand_alone(sensor, capture, frames):
+    if capture.modality == "tr" or events > _MOST or standing.tying(sensor, c, _stretch(capture, frames)):
         return None
     return lambda flux, streams, told: _by_stretches(sensor, capture, flux, streams, frames, told)
 

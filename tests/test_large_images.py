@@ -372,6 +372,40 @@ def test_frames_drawn_without_events_follow_the_sensors_law(
             laws.share_is(int(direct.sum()), direct.size, float(-np.expm1(-1.03 * rate * c.frame_time).mean()))
 
 
+def test_frames_behind_a_gate_are_not_drawn_without_their_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their pixels are blind for a part of each frame: of a gate of a tenth, as many detections as by events."""
+    gated = BINARY.replace("    dead_time", "    short_gate: {fraction: 0.1}\n    dead_time")
+    text = gated.replace("LIGHT", "900 nW/cm^2").replace("RULES", "device")
+    ones = []
+    for direct in (False, True):
+        if direct:
+            directly(monkeypatch)
+        made = config.build(document.parse(text, "binary.yaml"), Path())
+        ones.append(int(frames_of(made).sum()))
+    assert ones[0] == ones[1] > 1000
+
+
+@pytest.mark.parametrize(
+    "recorded",
+    [
+        "exposure: 300.3 ms, frames: 3003, frame_time: 9 us, frame_period: 100 us, readouts: [qis]",
+        "exposure: 30.03 ms, frames: 91, frame_time: 330 us, readouts: [counts], bits: 12, counting: counter",
+        "exposure: 30.03 ms, frames: 91, frame_time: 330 us, readouts: [counts], bits: 6, counting: counter",
+    ],
+)
+def test_the_estimate_is_of_what_is_recorded(recorded: str) -> None:
+    """Nothing in the gaps of frames, all counts of a counter, and none beyond its last; within 2 % of what is made."""
+    before = "exposure: 30.03 ms, frames: 3003, frame_time: 9 us, frame_period: 10 us, readouts: [qis]"
+    text = BINARY.replace("LIGHT", "900 nW/cm^2").replace("RULES", "device").replace(before, recorded)
+    if "counts" in recorded:
+        text = text.replace("reconstruct: [qis_counts]\n", "")
+    made = config.build(document.parse(text, "binary.yaml"), Path())
+    images = made.load_images()
+    found = made.simulate(made.levels[0], "train", images["train"], 0, 4)
+    seen = found.ones.sum() if found.tally is None else found.tally.sum()
+    assert plan.estimate(made, images, 1)["total"]["detections"] == pytest.approx(float(seen), rel=0.02)
+
+
 def test_frames_drawn_without_events_have_the_papers_bright_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     """9,740 of 10,000 frames of 10 us: 906.5 nW/cm^2 at 500 nm on 36 um^2, PDP 44.4 %; binomial counts."""
     directly(monkeypatch)

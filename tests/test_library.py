@@ -580,3 +580,20 @@ def test_times_in_single_precision_are_taken_where_they_are_known_well_enough() 
     short = sp.Capture("a", "tr", dark=True, exposure=1e-6)
     made = sp.Measurement.from_arrays(GRID, {short: (times * np.float32(1e-6), pixels)})
     assert len(made["a"].events) == 3
+
+
+@pytest.mark.parametrize("modality", ["qis", "tr", "str", "counts"])
+def test_one_recording_does_not_count_as_two(modality: str) -> None:
+    clock: dict[str, Any] = {"exposure": 4e-3} if modality == "tr" else {"frames": 400, "frame_time": 10e-6}
+    bits = {"bits": 4, "counting": "counter"} if modality == "counts" else {}
+    one, two, other = (sp.Capture(id, modality, **LIGHT, **clock, **bits) for id in ("one", "two", "other"))
+    made = sp.simulate(sensor(), [one, other], seed=3)
+    data, its_own = (
+        (made[id].events.times, made[id].events.rows) if modality == "tr" else made[id].frames
+        for id in ("one", "other")
+    )
+    if modality == "str":
+        one, two, other = (replace(capture, tick=1e-9) for capture in (one, two, other))
+    twice = sp.Measurement.from_arrays(sensor().layout, {one: data, other: its_own, two: data})
+    with pytest.raises(InputError, match=r"two: has the same detections as one, one by one; .* leave one of the capt"):
+        sp.compare(sensor(), twice, jobs=1)

@@ -241,9 +241,10 @@ class Effect(Plugin, abstract=True):
                 if name not in vars(cls):
                     setattr(cls, name, chosen in stages)
         cls.has_mean = "open" in have or ("factor" in have and "modulate" not in have)
-        changes = {"modulate", "spawn", "blind_time", "sensitivity"} & have or (chosen == "readout" and "apply" in have)
+        changing = {"modulate", "spawn", "blind_time", "sensitivity", "carried"}
+        changing |= {"apply"} if chosen == "readout" else set()
         if "states_mean" not in vars(cls):
-            cls.states_mean = cls.has_mean or not changes or cls.expected_rate is not Effect.expected_rate
+            cls.states_mean = cls.has_mean or not changing & have or cls.expected_rate is not Effect.expected_rate
         if "spawn" in vars(cls) and "hazard" not in vars(cls):
             cls.hazard = Effect.hazard  # type: ignore[method-assign]  # that of another spawn is not inherited
         super().__init_subclass__(**keywords)

@@ -59,10 +59,17 @@ class Flicker(Effect, stage="arrival"):
         return 1 + self.amplitude
 
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
-        """rate (1 + m (cos(phase) - cos(phase + s)) / s), s = 2 pi f exposure."""
+        """rate (1 + m s(f L) s(n d) / s(d) sin(phase + pi f L + pi (n - 1) d)), s(x) = sin(pi x) / (pi x).
+
+        That is the mean over n frames, each live for L: d is what f times the frame period misses of a whole number.
+        Of the whole exposure n is 1, and L is the exposure.
+        """
         if conditions.dark:
             return rate
-        swept = 2 * math.pi * self.frequency * conditions.exposure
-        # (cos(phase) - cos(phase + swept)) / swept, which must not lose its digits in slow flicker
-        mean = math.sin(self.phase + swept / 2) * math.sin(swept / 2) / (swept / 2)
-        return rate * (1 + self.amplitude * mean)
+        c, f = conditions, self.frequency
+        frames, live = (1, c.exposure) if c.live is None else (c.frames, c.live)
+        turns = f * c.frame_period
+        turns -= round(turns)
+        swing = np.sinc(f * live) * np.sinc(frames * turns) / np.sinc(turns)
+        middle = self.phase + math.pi * (f * live + (frames - 1) * turns)
+        return rate * (1 + self.amplitude * float(swing) * math.sin(middle))

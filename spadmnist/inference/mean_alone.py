@@ -1,4 +1,4 @@
-"""The null distribution of a capture of which the mean alone is known: by closed forms, corrected for fluctuations."""
+"""The null distribution of a capture of which the mean alone is known: by closed forms, corrected by simulation."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from .. import twin
-from ..effects import Effect
+from .. import hooks, twin
+from ..effects import Conditions, Effect
 from ..recording import Capture
 from ..sensor import Sensor
 from .closed_forms import CLOSED, closed_form, error_by_causes, events_in_frames, level_for
@@ -22,14 +22,17 @@ from .replicates import simulated
 # events of each of so many recordings of frames, by which the closed form of their mean is corrected: together they
 # have the noise of 1e6 counts, 0.1 %, in some tenths of a second
 _SHORT, _RECORDINGS = 1.25e5, 8
+_STAMPS = 300  # of a pixel: the first one comes too early by up to a dead time, 0.04 % of all counts at most
 _MOMENTS, _PIXELS = 1024, 1024  # moments and pixels over which a curve of the rate is averaged, at most
+_FEWEST = 16  # moments of an array that has too many pixels for the others
 
 
 def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> tuple[CaptureNull, np.ndarray]:
     """(null distribution of a capture whose mean alone is known, (replicates,) factors on its level).
 
-    It is by the closed forms of the effects, corrected for rates that fluctuate where the capture has frames. Its
-    scatter is that of the counts, of the last digit of the mean, of the closed forms, and of that correction.
+    It is by the closed forms of the effects, corrected for rates that fluctuate and for effects that do not say what
+    they do to the mean. Its scatter is that of the counts, of the last digit of the mean, of the closed forms, and of
+    that correction.
 
     Args:
         total: detections of the whole array.
@@ -44,9 +47,7 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     digits, expected_mean = total / sensor.layout.pixels, mean / sensor.layout.pixels
     rounding = last_digit(digits) / math.sqrt(12) / max(digits, expected_mean)
     caused = error_by_causes(sensor, capture)
-    apart, unsure = (
-        (0.0, 0.0) if capture.counts_events or not sensor.at("arrival") else _of_fluctuations(sensor, capture, level)
-    )
+    apart, unsure = _of_fluctuations(sensor, capture, level) if _is_bent(sensor, capture, level) else (0.0, 0.0)
     scatter = math.sqrt(share / mean + rounding**2 + CLOSED**2 + caused**2 + unsure**2)
     normal = stats.norm.ppf((np.arange(replicates) + 0.5) / replicates)
     order = np.random.Generator(np.random.SFC64(replicates)).permutation(replicates)
@@ -56,23 +57,52 @@ def of_mean(sensor: Sensor, capture: Capture, total: float, replicates: int) -> 
     ), np.ones(replicates)
 
 
-def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:
-    """(log of the share of frames with a detection over that of a steady rate, its standard error).
+def _is_bent(sensor: Sensor, capture: Capture, level: float) -> bool:
+    """Whether the closed form of the mean may be wrong.
 
-    Of a rate that follows a curve it is the mean over the exposure; of one that is drawn, that of short recordings.
+    Where all detections are counted, the mean rate alone matters, unless a dead time loses a part of them.
+    """
+    sensor = InTheDark.of(sensor) if capture.light.dark else sensor
+    if not (sensor.at("arrival") or _is_unsaid(sensor, capture)):
+        return False
+    if not capture.counts_events:
+        return True
+    light = np.full((1, sensor.layout.pixels), level)
+    events, counted = (float(part.sum()) for part in sensor.expected(light, capture.conditions, stamped=False))
+    return counted < events * (1 - CLOSED)
+
+
+def _is_unsaid(sensor: Sensor, capture: Capture) -> bool:
+    """Whether an effect changes the mean unsaid. A counter's gate does: its pixels open without a dead time."""
+    gated = capture.counts_events and capture.modality == "counts" and bool(sensor.at("gate"))
+    return gated or not all(effect.states_mean for effect in sensor.effects)
+
+
+def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:
+    """(log of the mean over that of the closed form, its standard error).
+
+    Of a rate that follows a curve it is the mean over the exposure. Of one that is drawn, and of an effect that does
+    not say what it does to the mean, it is that of short recordings.
     """
     sensor = InTheDark.of(sensor) if capture.light.dark else sensor
     curves = [effect for effect in sensor.at("arrival") if hasattr(effect, "factor")]
-    drawn = [effect for effect in sensor.at("arrival") if not hasattr(effect, "factor")]
     apart, c = _of_curves(sensor, curves, capture, level), capture.conditions
-    if not drawn:
-        return apart, 0.0
     steady = sensor.changed(effects=[effect for effect in sensor.effects if effect not in curves])
     steady = InTheDark.of(steady) if capture.light.dark else steady
+    if not (steady.at("arrival") or _is_unsaid(steady, capture)):
+        return apart, 0.0
     events = float(steady.expected(np.full((1, sensor.layout.pixels), level), c)[0].sum())
-    frames = max(math.ceil(c.frames * min(_SHORT / max(events, 1.0), 1.0)), 1)
-    clock = replace(c, frames=frames, exposure=frames * c.frame_period, bits=0)
-    short = replace(capture, modality="qis", mean=None, conditions=clock)  # a sum of frames has as many
+    # a pixel begins without a dead time, which must matter to none of many stamps
+    least = _SHORT if capture.modality != "tr" else max(_SHORT, _STAMPS * sensor.layout.pixels)
+    share = min(least / max(events, 1.0), 1.0)
+    frames = max(math.ceil(c.frames * share), 1)
+    clock = replace(c, frames=frames, exposure=frames * c.frame_period)
+    if capture.modality == "tr":
+        time = c.exposure * share
+        clock = replace(c, exposure=time, frame_time=time, frame_period=time)
+    short = replace(capture, mean=None, conditions=clock)
+    if not capture.counts_events:  # a sum of frames has as many
+        short = replace(short, modality="qis", conditions=replace(clock, bits=0))
     numbers = np.arange(_RECORDINGS, dtype=np.uint64)
     made = simulated(steady, short, np.full(_RECORDINGS, level), numbers, 0)
     logs = np.log([max(float(recording.totals.sum()), 0.5) for recording in made])
@@ -81,21 +111,37 @@ def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[fl
 
 
 def _of_curves(sensor: Sensor, curves: Sequence[Effect], capture: Capture, level: float) -> float:
-    """The log of the share of frames with a detection over that of the mean rate, where the rate follows curves."""
+    """The log of the mean over that of the mean rate, where the rate follows curves."""
     if not curves:
         return 0.0
-    light: np.ndarray = np.full((1, sensor.layout.pixels), level)
-    some = slice(None, None, -(-sensor.layout.pixels // _PIXELS))
+    c, pixels = capture.conditions.within_frames, sensor.layout.pixels
+    light: np.ndarray = np.full((1, pixels), level)
+    # hooks of dead times want all pixels
+    some, moments = slice(None, None, -(-pixels // _PIXELS)), _MOMENTS
+    if capture.counts_events:
+        some, moments = slice(None), max(min(_MOMENTS, _MOMENTS * _PIXELS // pixels), _FEWEST)
     rate, lit = (part[0, some] for part in sensor.rates(light, capture.conditions))
-    events = events_in_frames(sensor, light, capture.conditions)[0, some]
-    times = capture.conditions.within_frames.moments(_MOMENTS)
-    swing = np.zeros((_MOMENTS, 1))
+    times = c.moments(moments)
+    swing = np.zeros((moments, 1))
     for effect in curves:
         factor: np.ndarray = np.ravel(effect.factor(times, capture.conditions))[:, None]  # type: ignore[attr-defined]
         share = lit / np.maximum(rate, 1e-300) if effect.acts_on == "light" else 1.0
         swing = swing + share * (factor / factor.mean() - 1)
-    there = -np.expm1(-events * np.maximum(1 + swing, 0.0))
-    return math.log(float(there.mean(axis=0).sum()) / float(-np.expm1(-events).sum()))
+    factors = np.maximum(1 + swing, 0.0)
+    if capture.counts_events:
+        steady = sensor.expected(light, c, stamped=False)[0] / c.live_time
+        there, mean = (_counted(sensor, steady * by, c) for by in (factors, np.ones((1, 1))))
+    else:
+        events = events_in_frames(sensor, light, capture.conditions)[0, some]
+        there, mean = -np.expm1(-events * factors), -np.expm1(-events)[None]
+    return math.log(float(there.mean(axis=0).sum()) / float(mean.sum()))
+
+
+def _counted(sensor: Sensor, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
+    """The rates behind the dead time, 1/s, in the shape of those before it, (moments, pixels)."""
+    for effect in sensor.at("dead_time"):
+        rate = hooks.expected(effect, rate, conditions)
+    return rate
 
 
 def last_digit(value: float) -> float:

@@ -82,6 +82,17 @@ class ReducedCapture:
             room = c.count_frames * float(sensor.full_counts(c).sum())
         return room - self.detections < min(_FREE, room / 2)
 
+    def is_copy(self, other: ReducedCapture) -> bool:
+        """Whether both hold the same detections: enough of them, and every statistic has the same values."""
+        if self.counts is None or other.counts is None or self.detections < _FREE or not self.summaries:
+            return False
+        if self.capture.modality != other.capture.modality or self.last != other.last:
+            return False
+        pairs = [(mine.values, other.summaries[n].values) for n, mine in self.summaries.items() if n in other.summaries]
+        return np.array_equal(self.counts, other.counts) and all(
+            np.array_equal(*pair, equal_nan=True) for pair in pairs
+        )
+
     @classmethod
     def of(cls, recording: Recording, reduced: bool = True) -> ReducedCapture:
         """The reduction of a recording.

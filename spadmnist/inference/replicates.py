@@ -14,7 +14,8 @@ from typing import TypeVar
 import numpy as np
 
 from .. import twin
-from ..errors import UNABLE
+from ..errors import UNABLE, InputError
+from ..foreign import quoted
 from ..measurement import Measurement
 from ..recording import Capture, Recording
 from ..sensor import Sensor
@@ -183,8 +184,14 @@ class Replicates:
             if reduced:  # its replicates have as many detections: what is too large is refused before it is reduced
                 needed = memory.replicate_bytes(self.start, recording.capture, total, total)
                 memory.check(self.start, recording.capture, needed)
-            self.seen[capture.id] = ReducedCapture.of(recording, reduced)
+            found = self.seen[capture.id] = ReducedCapture.of(recording, reduced)
             del recording  # before the next one is read
+            same = [id for id, other in self.seen.items() if other is not found and found.is_copy(other)]
+            if same and not found.is_full(self.start):
+                raise InputError(
+                    f"{measurement.place(capture.id)}: has the same detections as {quoted(same[0])}, one by one; one "
+                    "recording would count as two: leave one of the captures out, or put its own file there"
+                )
 
     def recording(self, id: str) -> Recording:
         """The recording of a capture, with its corrected exposure where there is one."""
