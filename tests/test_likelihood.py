@@ -114,6 +114,35 @@ def test_dead_time_and_afterpulsing_are_covered(sensor: Sensor) -> None:
         check(answers, key, truth)
 
 
+def test_many_pixels_with_few_events_each_do_not_hide_afterpulses(tmp_path: Path) -> None:
+    """A rate for each of 4,096 pixels, maximized, would be 6 standard errors of the probability. False alarms: 1e-6."""
+    text = SENSOR.replace("rows: 4, columns: 4", "rows: 64, columns: 64").replace("rate: 100 Hz", "rate: 5 kHz")
+    text = text.replace("afterpulsing: {probability: 0.5 %, lifetime: 25 ns}", "slow_afterpulsing: {lifetime: 20 us}")
+    (tmp_path / "sensor.yaml").write_text(text)
+    slow = config.read_sensor(tmp_path / "sensor.yaml").resolved()
+    key = ("slow_afterpulsing", "probability")
+    hidden = with_values(slow, {key: 0.02})
+    capture = Capture("dark", "tr", Light(), Conditions(4e-3, 1, 4e-3, 4e-3, None))
+    one = np.zeros(1, np.uint64)
+    (data,) = model_recordings(hidden, capture, np.zeros(1), Streams(11, "pixels", "data", one), one)
+    (wanted,) = named(slow, "set slow_afterpulsing.probability")
+    exact = maximise(slow, [data], [replace(wanted, shapes=())])
+    low, high = exact.intervals[key]
+    assert abs(exact.values[key] - 0.02) < 4.9 * (high - low) / 3.92
+
+
+def test_what_another_change_can_take_up_is_no_evidence(sensor: Sensor) -> None:
+    """The ratio of an effect that is not there, beside a number that has part of its trace."""
+    truth = with_values(sensor, {CHANCE: 0.02, LIFETIME: 400e-9, RATE: 5000.0})
+    model = with_values(truth, {CHANCE: 0.01})
+    listed = replace(*named(model, "set afterpulsing.probability"), shapes=())
+    added = named(model, "add slow_afterpulsing")
+    for data in stamps(truth, 0.64, 0.0, 3):
+        both = maximise(model, [data], [listed, *added])
+        alone = maximise(model, [data], [listed])
+        assert both.likelihood_ratios[1] == pytest.approx(2 * (both.value - alone.value), abs=0.3)
+
+
 @pytest.mark.slow
 def test_a_rate_is_covered_with_its_light(sensor: Sensor) -> None:
     truth = 3000.0

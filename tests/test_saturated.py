@@ -94,6 +94,10 @@ RIGHT |= {
         sp.Sensor(Layout(8, 8, PIXEL, 1.0), [sp.effects.Detection(pdp=0.3), sp.effects.Tdc(resolution=1e-6)]),
         [sp.Capture("f", "str", irradiance=irradiance(6e5), **LATE)],
     ),
+    "a lamp that fluctuates, in frames that are nearly full": (
+        sensor(sp.effects.SourceNoise(contrast=0.15, coherence_time=10e-3), side=8, ticks=False),
+        [sp.Capture("f", "qis", irradiance=irradiance(7e5), **{**LATE, "frames": 4000})],
+    ),
     "flicker in frames with gaps": (
         sensor(sp.effects.Flicker(amplitude=0.3, frequency=100.0, phase=1.0), side=8, ticks=False),
         [sp.Capture("f", "qis", irradiance=irradiance(5e4), frame_period=3 * FRAME, **LATE)],

@@ -91,6 +91,20 @@ def test_means_that_the_model_has_are_adequate(tmp_path):
     assert diagnose(sensor, data, quick=True, jobs=1).verdict == "adequate"
 
 
+def test_a_light_level_that_is_near_that_of_another_wavelength_is_none(tmp_path):
+    """Three quarters of the light: at 700 nm it would give 0.653, and 5 % of uncertainty are no reason to name that."""
+    means = {id: (*PAPER[id][:3], mean) for id, mean in {"low-500": 457, "low-700": 60, "high-700": 4184}.items()}
+    means["high-500"] = (PAPER["high-500"][0], 200.0, "10 us", 0.0)
+    right = measured(tmp_path, means)
+    sensor = config.read_sensor(tmp_path / "sensor.yaml")
+    expected = closed_form(sensor, right.capture("high-500"))
+    level = twin.photons_at(right.capture("high-500"), sensor.layout)
+    means["high-500"] = (*means["high-500"][:3], round(expected(0.75 * level) / 256, 1))
+    found = diagnose(sensor, measured(tmp_path, {"dark": PAPER["dark"], **means}, 0.05), quick=True, jobs=1)
+    named = {e["quantity"] for e in found.setup if e["capture"] == "high-500"}
+    assert named == {"light", "exposure"} and all(e["confused"] for e in found.setup), found.setup
+
+
 @pytest.mark.parametrize("factor", [1.08, 0.92])
 def test_a_light_level_beyond_its_uncertainty_is_no_pdp(tmp_path, factor):
     means = {id: (*PAPER[id][:3], mean) for id, mean in {"low-500": 457, "low-700": 60, "high-700": 4184}.items()}

@@ -35,6 +35,9 @@ EDGE_FALL = 5.99
 _FAR = 100.0
 # of the log-likelihood: a value that is higher by more shows that a maximum is none; a rule of thumb
 _HIGHER = 0.05
+_MAXIMA = (
+    4  # maxima, each found on the way along the last one's profiles, after which there are too many; a rule of thumb
+)
 # tolerances of `by_simplex`: of its first size, and of the log-likelihood; near enough for a parabola, a rule of thumb
 _ROUGH = 0.3, 0.5
 # bytes of the time stamps and gaps of all captures, at most; more is fitted by simulation. Chosen so that they and the
@@ -51,7 +54,8 @@ class MaximumLikelihood:
 
     Attributes:
         values, intervals: by (effect, parameter), SI.
-        likelihood_ratios: twice the log-likelihood ratio of each change.
+        likelihood_ratios: twice the log-likelihood ratio of each change, the others fitted again without it.
+        value: of the log-likelihood.
         free: the fitted parameters.
         correlations: (n, n) of these, by the curvature at the maximum.
     """
@@ -59,6 +63,7 @@ class MaximumLikelihood:
     values: dict[Key, float]
     intervals: dict[Key, tuple[float, float]]
     likelihood_ratios: list[float]
+    value: float
     free: tuple[Key, ...]
     correlations: np.ndarray
 
@@ -318,7 +323,7 @@ def _maximum(
         _, u = by_simplex(function, u, scale, ends, _ROUGH)
         top = maximum(function, u, scale, ends)
         assert top is not None
-    for _ in range(3):
+    for _ in range(_MAXIMA):
         profiles = [
             [profile_end(function, top, i, sign, function.fall(i, top.u), ends) for sign in (-1, 1)]
             if top.informed[i]
@@ -330,18 +335,26 @@ def _maximum(
         # this was not the maximum
         top = maximum(function, function.highest[1], top.spreads, ends)
         assert top is not None
+    else:
+        raise NoLikelihood("several maxima")
     best, u = top.value, top.u
     intervals = {d.key: d.interval(*profile) for d, profile in zip(coordinates, profiles, strict=True)}
     found = {d.key: d.value(float(x)) for d, x in zip(coordinates, u, strict=True)}
     likelihood_ratios = []
     for candidate in candidates:
-        # the others stay
         own = {*dict(candidate.fixed), *(d.key for d in candidate.coordinates)}
-        rest = {key: value for key, value in {**fixed, **found}.items() if key not in own}
-        without = Likelihood(sensor, data, (), rest)
-        without.begin(np.zeros(0))
+        some = [i for i, d in enumerate(coordinates) if d.key not in own]
+        rest = {key: value for key, value in fixed.items() if key not in own}
+        without = Likelihood(sensor, data, [coordinates[i] for i in some], rest)
+        without.begin(u[some])
         without.own = function.own
-        likelihood_ratios.append(2 * (best - without(np.zeros(0))))
+        # the others take up what they can of it
+        lower = without(u[some])
+        if some:
+            other = maximum(without, u[some], top.spreads[some], ends[:, some])
+            assert other is not None
+            lower = max(other.value, without.highest[0])
+        likelihood_ratios.append(2 * (best - lower))
     inverse = np.linalg.inv(top.curved)
     # of some coordinates the value falls as they rise
     spread = np.sqrt(np.diag(inverse)) * [-1.0 if d.lacks else 1.0 for d in coordinates]
@@ -349,6 +362,7 @@ def _maximum(
         values={**fixed, **found},
         intervals=intervals,
         likelihood_ratios=likelihood_ratios,
+        value=best,
         free=tuple(found),
         correlations=inverse / np.outer(spread, spread),
     )

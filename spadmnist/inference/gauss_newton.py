@@ -35,6 +35,7 @@ _VAIN = 2  # steps in a row without a fall, the second one shorter, after which 
 # squared norm of a column of the Jacobian below which the coordinate is not informed, with a standard error above 4.5:
 # it then stays where it is, and its error is infinite
 _BLIND = 0.05
+_SINGULAR = 1e-10  # of the largest eigenvalue of J^T J: a smaller one is rounding, and nothing moves along it
 
 
 @dataclass
@@ -170,7 +171,7 @@ def gauss_newton(
             break
         cost, u0, z = best
         normal = jacobian.T @ jacobian
-        step = -np.linalg.pinv(normal + damping * np.diag(np.diag(normal)), rcond=1e-8) @ (jacobian.T @ z)
+        step = _downhill(normal + damping * np.diag(np.diag(normal)), jacobian.T @ z, coordinates, u0)
         step = step * min(1.0, float(np.min(limit / np.maximum(np.abs(step), 1e-12))))
         u = np.array([d.coordinate(d.value(float(x))) for d, x in zip(coordinates, u0 + step, strict=True)])
         promised = float(cost - ((z + jacobian @ (u - u0)) ** 2).sum())
@@ -194,6 +195,29 @@ def gauss_newton(
         square=cost,
         values=at(u),
     )
+
+
+def _downhill(normal: np.ndarray, gradient: np.ndarray, coordinates: Sequence[Coordinate], u: np.ndarray) -> np.ndarray:
+    """The step to the least squares within the search ranges, (coordinates,).
+
+    Where a coordinate would leave its range it stays at the end, and the others have their best values beside it.
+
+    Args:
+        normal: J^T J; gradient: J^T z.
+        u: (coordinates,) the point.
+    """
+    ends = np.array([d.ends for d in coordinates]).reshape(-1, 2).T
+    step, free = np.zeros(len(u)), np.ones(len(u), bool)
+    while free.any():
+        left = gradient + normal[:, ~free] @ step[~free]
+        step[free] = -np.linalg.pinv(normal[np.ix_(free, free)], rcond=_SINGULAR) @ left[free]
+        inside = np.clip(u + step, *ends) - u
+        out = free & (np.abs(inside - step) > 1e-12)
+        step = np.where(out, inside, step)
+        if not out.any():
+            break
+        free &= ~out
+    return step
 
 
 def _points_aside(
@@ -292,7 +316,7 @@ def gauss_newton_step(
         jacobian = _jacobian(replicates, evaluation, coordinates, u, sensors_of, by)
     covariance = covariance_of(jacobian, replicate_residuals)
     error = np.sqrt(np.minimum(np.diag(covariance), 1.0))
-    step = -np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10) @ (jacobian.T @ z)
+    step = _downhill(jacobian.T @ jacobian, jacobian.T @ z, coordinates, u)
     # a coordinate that is not informed stays
     step = np.where(np.isfinite(np.diag(covariance)), np.clip(step, -5 * error, 5 * error), 0.0)
     point = np.array([d.coordinate(d.value(float(x))) for d, x in zip(coordinates, u + step, strict=True)])

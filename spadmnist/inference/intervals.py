@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
+import numpy as np
+
 from ..errors import UNABLE
 from ..measurement import Measurement
 from .candidates import with_values
@@ -12,7 +14,7 @@ from .capture_replicates import CannotSimulate
 from .coordinates import Coordinate, Key
 from .evaluation import evaluate, square
 from .exact_likelihood import NoLikelihood, maximise, not_in_likelihood, recordings
-from .gauss_newton import error_scale
+from .gauss_newton import Fit, error_scale
 from .joint_fit import fit_all, model_of
 from .model_path import ModelPath, keys_of
 from .replicates import FEW
@@ -142,7 +144,7 @@ def _scaled(value: Value, coordinate: Coordinate, factor: float) -> Value:
 def open_ends(path: ModelPath) -> None:
     """Extend the interval of a shape to an end of its range that the data do not exclude.
 
-    The covariance does not show it.
+    The covariance does not show it. The other numbers of the fit follow, as they do along its valley.
     """
     tests, free = [], path.free
     for step in path.steps:
@@ -155,7 +157,7 @@ def open_ends(path: ModelPath) -> None:
                     (step, coordinate, end) for end in (coordinate.low, coordinate.high) if not v.low <= end <= v.high
                 ]
     evaluation, replicates = path.evaluation, path.replicates
-    models = [path.model_at(evaluation, {coordinate.key: end}) for _, coordinate, end in tests]
+    models = [path.model_at(evaluation, _along(path.fit, coordinate, end)) for _, coordinate, end in tests]
     some = [captures_showing(step.template, IGNORED[0]) for step, _, _ in tests]
     now = square(evaluation.residuals)
     for (step, coordinate, end), signature in zip(
@@ -163,7 +165,34 @@ def open_ends(path: ModelPath) -> None:
     ):
         if isinstance(signature, CannotSimulate):
             continue
-        if square(residuals_at(replicates, evaluation, signature)) < now + EXCLUDED:
+        if square(residuals_at(replicates, evaluation, signature)) < now + EXCLUDED * _inflation(path.fit, coordinate):
             v = step.values[coordinate.parameter]
             assert v.low is not None and v.high is not None
             step.values[coordinate.parameter] = replace(v, low=min(v.low, end), high=max(v.high, end))
+
+
+def _naive(fit: Fit) -> np.ndarray:
+    """The covariance of a fit if its cells were independent, (coordinates, coordinates)."""
+    jacobian = np.concatenate([np.zeros((0, len(fit.coordinates))), *fit.jacobian.values()])
+    return np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10)
+
+
+def _along(fit: Fit | None, coordinate: Coordinate, end: float) -> dict[Key, float]:
+    """The values with a coordinate at an end of its range, and the others of the fit where they fit best beside it."""
+    if fit is None or coordinate not in fit.coordinates:
+        return {coordinate.key: end}
+    i, naive = fit.coordinates.index(coordinate), _naive(fit)
+    if not naive[i, i] > 0:
+        return {coordinate.key: end}
+    point = fit.point + naive[:, i] / naive[i, i] * (coordinate.coordinate(end) - fit.point[i])
+    values = {d.key: d.value(float(x)) for d, x in zip(fit.coordinates, point, strict=True)}
+    return {**values, coordinate.key: end}
+
+
+def _inflation(fit: Fit | None, coordinate: Coordinate) -> float:
+    """The factor by which the squares of dependent cells rise more than those of independent ones, at least 1."""
+    if fit is None or coordinate not in fit.coordinates:
+        return 1.0
+    i, naive = fit.coordinates.index(coordinate), _naive(fit)
+    wider = fit.covariance[i, i] / naive[i, i] if naive[i, i] > 0 else 1.0
+    return max(float(wider), 1.0) if np.isfinite(wider) else 1.0

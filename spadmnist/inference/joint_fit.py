@@ -232,6 +232,8 @@ def repeated_steps(
             break
         fit, borrowed_columns = closer, path.approximate
         promised = square(evaluation.residuals) - closer.square
+        if promised < 0:  # a step that was cut short leads uphill
+            fit = replace(closer, point=point_of(coordinates, here), residuals=evaluation.residuals)
         later = roughly and path.approximate  # what a Jacobian of other models promises little of can wait
         if turn == (_MOVES if later else _AGAIN) or promised < (_WORTH_AT_ONCE if later else WORTH):
             break

@@ -125,7 +125,9 @@ class CaptureNull:
         level = uncertainty * self.elasticity_at(self.stated) if uncertainty else 0.0
         if mean > self.most / 2:  # of what can be full, by what is not full
             free, wanted = max(self.most - total, 0.0), max(self.most - mean, 1e-3)
-            wider = math.hypot(1.0, level * mean / math.sqrt(max(wanted, 1.0)))
+            made = float(self.totals.mean())
+            wider = max(self._scatter * made / math.sqrt(max(self.most - made, 1.0)), 1.0)
+            wider = math.hypot(wider, level * mean / math.sqrt(max(wanted, 1.0)))
             return -float(poisson_scores(np.array([free]), np.array([wanted]))[0]) / wider
         if self.saturated:  # a full bus scatters less than counts do, and by a count at least
             return (total - mean) / max(math.hypot(self._scatter, level) * mean, 1.0)

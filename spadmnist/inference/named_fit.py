@@ -155,7 +155,7 @@ def _maximum_likelihood(
             break
         again = maximise(replicates.start, data, wider)
         at_end = [_further(candidate, again) for candidate in wider] != wider
-        if at_end and sum(again.likelihood_ratios) < sum(found.likelihood_ratios) + FALL_95:
+        if at_end and 2 * (again.value - found.value) < FALL_95:
             break  # as good as before: the data do not say how far beyond it lies
         wanted, found = wider, again
     return wanted, found

@@ -33,7 +33,11 @@ from .signature import Signature, residuals_at, signature_of_totals, signatures
 from .trial import Trial
 
 TIE = 6.0  # in chi square: explanations nearer than that are a tie, and all are named; a rule of thumb
-_VERIFIED = 3  # rivals of the set-up that are simulated, the best ones: the time of a step; a rule of thumb
+_VERIFIED = 3  # rivals of the set-up that fit, after which no more are simulated: the time of a step; a rule of thumb
+# relative, of the ratio of the PDP at two wavelengths: what a data sheet's curve is read to; a rule of thumb
+_PDP_ERROR = 0.01
+# of a logarithm: a smaller error of the light, or of the exposure, is no rarer than another wavelength; a rule of thumb
+_ORDINARY = 0.25
 # of a logarithm: the largest factor on an exposure that is looked for, 1,100; a rule of thumb
 _FURTHEST = 7.0
 _MOST = 300.0  # of a logarithm: beyond any light; a larger one would overflow a double
@@ -230,12 +234,14 @@ def _names(
 ) -> list[str]:
     """The quantities that a factor on a capture's level may be.
 
-    It is the wavelength where another one fits, otherwise light or exposure.
+    It is light or exposure. Where the wavelength of another capture gives that factor, it is this one, and light and
+    exposure as well if the factor is one that they often have.
     """
     capture = replicates.seen[id].capture
     if factor.quantity != "light" or (factor.whole and len(factor.captures) > 1):
         return [factor.quantity]
     own = twin.photons_at(capture, evaluation.sensors.one.layout)
+    others = ["light", "exposure"] if replicates.seen[id].early is None else ["light"]
     for wave in sorted({s.capture.light.wavelength or 0.0 for s in replicates.seen.values()} - {0.0}):
         if wave == capture.light.wavelength or not own:
             continue
@@ -245,9 +251,10 @@ def _names(
             continue
         sensor = evaluation.sensors.one
         ratio = there * sensor.nominal_pdp(wave) / (own * sensor.nominal_pdp(capture.light.wavelength))
-        if abs(math.log(ratio) - log) < 3 * math.hypot(error, 0.01 + capture.light.relative_uncertainty):
-            return ["wavelength"]
-    return ["light", "exposure"] if replicates.seen[id].early is None else ["light"]
+        # the error has the uncertainty of the light in it
+        if abs(math.log(ratio) - log) < 3 * math.hypot(error, _PDP_ERROR):
+            return ["wavelength", *(others if abs(log) < _ORDINARY else [])]
+    return others
 
 
 def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
@@ -289,13 +296,12 @@ def rivals(scan: Scan, evaluation: Evaluation, cost: float) -> list[Trial]:
             z = evaluation.residuals[TOTALS]
             fit.fall = float(z @ z) - remains
             out.append(fit)
-    out = sorted(out, key=lambda t: t.cost(evaluation))[:_VERIFIED]
-    models = [t.sensors for t in out if t.sensors is not None]
-    return [
-        t
-        for t, signature in zip(out, signatures(replicates, evaluation, models), strict=True)
-        if _fits(scan, evaluation, t, signature)
-    ]
+    out, found = sorted(out, key=lambda t: t.cost(evaluation)), list[Trial]()
+    while out and len(found) < _VERIFIED:
+        some, out = out[:_VERIFIED], out[_VERIFIED:]
+        made = signatures(replicates, evaluation, [t.sensors for t in some if t.sensors is not None])
+        found += [t for t, one in zip(some, made, strict=True) if _fits(scan, evaluation, t, one)]
+    return found
 
 
 def rivals_with_a_factor(scan: Scan, evaluation: Evaluation, one: SetupExplanation) -> list[tuple[Trial, Factor]]:
