@@ -6,6 +6,7 @@ No tag runs anything; aliases are refused (a few bytes of them can stand for gig
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -75,6 +76,13 @@ class Document:
             dotted += f"[{part}]" if isinstance(part, int) else f"{'.' if dotted else ''}{part}"
         where = f"{self.name}:{line}" if line else self.name
         return f"{where}: {dotted}" if dotted else where
+
+
+def path_of(path: object, what: str) -> Path:
+    """The path of a file. Raises InputError where it is none; what: it should be the path of."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{path!r:.80} is of type {type(path).__name__}; give the path of {what}")
+    return Path(path)
 
 
 def read(path: Path) -> Document:

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+from . import units
+
 PLANCK = 6.62607015e-34  # J s, exact (SI 2019)
 SPEED_OF_LIGHT = 299792458.0  # m/s, exact
 LUMINOUS_EFFICACY = 683.0  # lm/W at 555 nm (paper, eq. 2)
+GREEN = 555e-9  # m, of light of which the efficacy holds
+_NEAR = 0.5e-9  # m: a wavelength that is written with three digits
 
 
 def photon_energy(wavelength: float) -> float:
     """E_ph = h c / lambda (J), wavelength in m (paper, below eq. 3)."""
     return PLANCK * SPEED_OF_LIGHT / wavelength
+
+
+def of_lux(wavelength: float) -> str | None:
+    """What is to be known of a level in lux at a wavelength (m); None at 555 nm, where it holds."""
+    if abs(wavelength - GREEN) < _NEAR:
+        return None
+    return (
+        "lux is turned into power with 683 lm/W, which holds at 555 nm, not at "
+        f"{units.show(wavelength, 'm')}; give irradiance where the light is not green"
+    )
 
 
 def photons_from_lux(lux: float, active_area: float, wavelength: float) -> float:

@@ -57,7 +57,7 @@ def look(measurement: Measurement, capture: Capture, recorded: Recording | None)
         "mean": capture.mean,
         **dict.fromkeys(("detections", "rate_median", "rate_mean", "rate_min", "rate_max", "empty_pixels")),
         **dict.fromkeys(("hot_pixels", "dead_pixels", "ones_share", "shortest_interval")),
-        "notes": list(measurement.notes.get(capture.id, [])),
+        "notes": [*capture.notes, *measurement.notes.get(capture.id, [])],
     }
     frames = capture.modality in ("qis", "str")
     if capture.mean is not None:

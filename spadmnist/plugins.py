@@ -566,6 +566,8 @@ def check_values(plugin: Plugin) -> None:
             if declared.by_wavelength:
                 how = "a table over the wavelength is spadmnist.effects.ByWavelength((500e-9, 700e-9), (0.4, 0.2))"
             raise InputError(f"{place} is {value!r:.80}; in Python it is a number, and {how}")
+        if np.ma.is_masked(value):
+            raise InputError(f"{place} has masked pixels, which have no value; give each one (array.filled)")
         numbers = np.asarray(value.values if isinstance(value, ByWavelength) else value)
         if numbers.dtype.kind not in "fiu":
             raise InputError(f"{place} is {value!r}; it is a number in {declared.unit or 'units of 1'}")
@@ -586,6 +588,8 @@ def described(declared: Parameter, value: Any) -> str:
 
     if value is None:
         return "-"
+    if isinstance(value, Mapping | complex):  # no value, as `check_values` says
+        return f"{value!r:.80}"
     if isinstance(value, ByWavelength):
         pairs = zip(value.wavelengths, value.values, strict=True)
         return ", ".join(f"{units.show(at, 'm')}: {number(x)}" for at, x in pairs)

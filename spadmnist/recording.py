@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from . import bit_planes
+from . import bit_planes, light
 from .effects import Conditions
 from .errors import InputError
 from .events import Events, Layout, SealedEvents, read_only
@@ -79,6 +79,15 @@ class Capture:
     conditions: Conditions
     mean: float | None = None
     tick: float | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is to be known of its description before it is used."""
+        lit = self.light
+        if lit.level is None or lit.wavelength is None or lit.kind_of_level != "lux":
+            return ()
+        note = light.of_lux(lit.wavelength)
+        return () if note is None else (note,)
 
     @property
     def counts_events(self) -> bool:

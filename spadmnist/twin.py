@@ -7,6 +7,7 @@ that is exact: where frames do not depend on each other.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import bit_planes, light, recording, standing, units
+from . import bit_planes, light, recording, standing, system, units
 from .effects import Conditions
 from .errors import InputError
 from .events import Layout
@@ -149,7 +150,13 @@ def _by_stretches(
 def _by_bits(sensor: Sensor, capture: Capture, flux: np.ndarray, streams: Streams, told: _Told) -> Recording:
     """Frames that stand alone and are not stamped."""
     c, (rows, columns) = capture.conditions, sensor.layout.shape
-    out = np.empty((c.frames, rows, -(-columns // 8)), np.uint8)
+    shape = c.frames, rows, -(-columns // 8)
+    if math.prod(shape) > system.memory():
+        raise InputError(
+            f"{capture.id}: its {c.frames:,} frames of {rows} x {columns} pixels take "
+            f"{math.prod(shape) / 2**30:,.0f} GiB, more memory than there is; shorten it"
+        )
+    out = np.empty(shape, np.uint8)
     for row, bits in standing.bits(sensor, c, flux, streams):
         count = len(bits) // columns
         out[:, row : row + count] = bit_planes.frames_first(bits, c.frames, count, columns)

@@ -61,6 +61,7 @@ WRITTEN = 6
 # SI units: what a time or a level that a file declares may be; beyond it the number is damaged
 SHORTEST, LONGEST = 1e-18, 1e18
 WAVELENGTHS = 10e-9, 100e-6  # m, of light: what is beyond is another unit, mistaken
+LARGEST_PIXEL = 1e-4  # m^2, its area: more is another unit, mistaken; large single detectors have 1e-6 to 4e-5
 
 
 class Quantity(float):

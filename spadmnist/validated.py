@@ -41,7 +41,8 @@ class Amount:
     def read(self, raw: object) -> units.Quantity:
         value = units.parse(raw, self.unit)
         if value < 0 or (value == 0 and not self.zero) or value > self.most:
-            upper = "" if self.most == math.inf else f" and at most {self.most:g} ({100 * self.most:g} %)"
+            upper = f" and at most {units.show(self.most, self.unit)}" if self.most < math.inf else ""
+            upper = f" and at most {self.most:g} ({100 * self.most:g} %)" if upper and not self.unit else upper
             raise ValueError(f"{value} is not possible; it must be {'at least' if self.zero else 'more than'} 0{upper}")
         if self.within is not None and not self.within[0] <= value <= self.within[1]:
             low, high = (units.show(end, self.unit) for end in self.within)
@@ -57,7 +58,7 @@ class Amount:
 
 Time = Annotated[units.Quantity, Amount("s")]
 Wavelength = Annotated[units.Quantity, Amount("m", within=units.WAVELENGTHS)]
-Area = Annotated[units.Quantity, Amount("m^2")]
+Area = Annotated[units.Quantity, Amount("m^2", most=units.LARGEST_PIXEL)]
 Lux = Annotated[units.Quantity, Amount("lux")]
 Irradiance = Annotated[units.Quantity, Amount("W/m^2")]
 Share = Annotated[units.Quantity, Amount("", most=1)]

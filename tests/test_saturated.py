@@ -96,7 +96,7 @@ RIGHT |= {
     ),
     "a lamp that fluctuates, in frames that are nearly full": (
         sensor(sp.effects.SourceNoise(contrast=0.15, coherence_time=10e-3), side=8, ticks=False),
-        [sp.Capture("f", "qis", irradiance=irradiance(7e5), **{**LATE, "frames": 4000})],
+        [sp.Capture("f", "qis", irradiance=irradiance(7e5), **{**LATE, "frames": 4000, "relative_uncertainty": 0.0})],
     ),
     "flicker in frames with gaps": (
         sensor(sp.effects.Flicker(amplitude=0.3, frequency=100.0, phase=1.0), side=8, ticks=False),

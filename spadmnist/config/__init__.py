@@ -12,8 +12,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from .. import document, store
-from ..document import Document, Path_
+from .. import document, light, store
+from ..document import Document, Path_, path_of
 from ..errors import ConfigError, InputError, did_you_mean
 from ..experiment import Experiment
 from ..readout import READOUTS
@@ -94,8 +94,9 @@ def read_sensor(path: str | Path) -> Sensor:
 
     Raises ConfigError with every mistake, or InputError where a file cannot be read.
     """
-    source = document.read(Path(path))
-    reader = _Reader(source, Path(path).resolve().parent, [])
+    path = path_of(path, "a sensor file")
+    source = document.read(path)
+    reader = _Reader(source, path.resolve().parent, [])
     raw: Any = source.value
     place: Path_ = ()
     if isinstance(raw, Mapping) and "sensor" in raw:
@@ -210,10 +211,5 @@ def of_sensor(
 
 
 def _notes(scene: _Scene, source: Document) -> tuple[str, ...]:
-    other = next((one for one in scene.wavelengths if abs(one - 555e-9) > 0.5e-9), None)
-    if scene.lux and other is not None:
-        return (
-            f"{source.place(('scene', 'wavelength'))}: lux is turned into power with 683 lm/W, which holds at 555 nm, "
-            f"not at {other}; give irradiance where the light is not green",
-        )
-    return ()
+    found = [note for one in scene.wavelengths if (note := light.of_lux(float(one)))] if scene.lux else []
+    return tuple(f"{source.place(('scene', 'wavelength'))}: {note}" for note in found[:1])

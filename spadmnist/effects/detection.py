@@ -7,6 +7,9 @@ import numpy as np
 from ..plugins import ByWavelength
 from . import Conditions, Effect, Mimic, parameter
 
+# of the PDP times `relative`, in the median: more is a map in other units. Factors of up to 2 are tried, of any PDP
+_MOST = 2.0
+
 
 class Detection(Effect, stage="detection"):
     """A photon starts an avalanche with the probability PDP.
@@ -40,6 +43,15 @@ class Detection(Effect, stage="detection"):
         search=(0, 2),
         per_pixel=True,
     )
+
+    def made(self, chip: object) -> None:
+        pdps = self.pdp.values if isinstance(self.pdp, ByWavelength) else (self.pdp,)
+        typical = max(float(np.median(np.asarray(one) * self.relative)) for one in pdps)
+        if typical > _MOST:
+            raise ValueError(
+                f"the PDP times relative is {typical:.3g} in the median; it is a share of the photons, and relative is "
+                "1 in a typical pixel: divide a measured map by its median"
+            )
 
     def pdp_at(self, wavelength: float | None) -> np.ndarray:
         """PDP at a wavelength (m): one value, or one per pixel."""

@@ -34,7 +34,7 @@ class TdcNonlinearity(Effect, stage="timing"):
         search=(0, 6),
         per="code",
     )
-    period = parameter(140.0, "", "number of codes in a period of the coarse clock", bounds=(1, None))
+    period = parameter(140.0, "", "number of codes in a period of the coarse clock", bounds=(1, 1 << 24))
 
     def made(self, chip: Chip) -> None:
         if self.period != int(self.period):

@@ -305,6 +305,8 @@ def holds_detections(path: Path, names: Collection[str], frames: bool, said: Sai
 def damaged(path: Path, error: Exception) -> InputError:
     """What to say of a file that another library cannot read."""
     reason = image_files.reason(error)
+    if "Python objects" in reason:
+        return InputError(f"{path}: holds Python objects, which are not read; store whole numbers (uint8) or bool")
     return InputError(f"{path}: is damaged or cut short ({reason}); copy it again from where it was made")
 
 

@@ -154,7 +154,8 @@ def import_files(
         found = one.read()
         others = [other.capture for other in ones if other.capture]
         one.capture = _capture(one, found, said, planned, others, notes)
-        notes += [f"{one.path}: {note}" for note in (*found.notes, *stacks.axes_note(found, one.said))]
+        of_file = (*found.notes, *stacks.axes_note(found, one.said), *one.capture.notes)
+        notes += [f"{one.path}: {note}" for note in of_file]
         shape = _shape(one.path, found, one.said)
         if shape is not None:
             shapes.append(shape)

@@ -256,12 +256,28 @@ _UNPACKED: dict[str, tuple[int, Callable[[bytes, int], int]]] = {
 }
 
 
+_LOOKED_AT = 1 << 24  # bytes at the beginning of a file by which its form is doubted
+_SURE = 20  # values other than 0 among them: fewer look odd by chance
+
+
+def _odd_bytes(some: np.ndarray, counts: bool) -> tuple[str, ...]:
+    """A note where frames look as if they were stored in another way than they are read."""
+    values = some[some > 0]
+    if len(values) < _SURE:
+        return ()
+    if not counts and np.all(values == 1):
+        return ("each of its bytes is 0 or 1; if they are a byte for each pixel, not eight pixels, add --bits 1",)
+    if counts and some.itemsize == 2 and np.all(values % 256 == 0):
+        return ("each of its counts is a multiple of 256; if the high byte stands first, store the low one first",)
+    return ()
+
+
 class Raw(Format):
     """Raw frames as a camera's memory holds them, 512 x 512 where nothing else is said, row after row.
 
     Bits, eight columns to a byte, the high bit the left pixel (--bit-order little: the low bit); with --bits counts of
-    so many bits, a byte each, above 8 bits two with the low byte first. Four bytes `DONE` at the end, which a transfer
-    over the network leaves, are passed over. Frames are not turned.
+    so many bits, a byte each (--bits 1: 0 or 1), above 8 bits two with the low byte first. Four bytes `DONE` at the end,
+    which a transfer over the network leaves, are passed over. Frames are not turned.
 
     Source: public readers of the SPAD512 and SPAD512S agree on this order; no document of its maker was at hand.
     """
@@ -278,7 +294,7 @@ class Raw(Format):
         counts = said.modality == "counts" or (said.bits is not None and said.modality is None)
         if counts and said.bits is None:
             raise ask(path, ["bits"])
-        if counts and (said.packed or said.bits == 1):
+        if counts and said.packed:
             raise InputError(f"{path}: bits, eight to a byte, are no counts; leave out --packed or --bits")
         rows, columns, size = said.rows or 512, said.columns or 512, path.stat().st_size
         if not counts and columns % 8:
@@ -304,5 +320,6 @@ class Raw(Format):
         sized = f"{rows} x {columns} " + ("as said" if said.rows and said.columns else "where nothing else is said")
         sources = dict.fromkeys(("rows", "columns"), sized)
         notes = ("begins as a file that gzip packed; if it is one, unpack it and import what comes out",) * packed
+        notes += _odd_bytes(stack.get(0, max(1, min(size // each, _LOOKED_AT // each))), counts)
         known = {"rows": rows, "columns": columns}
         return Found(known, frames=stack, bits=not counts, packed=not counts, sources=sources, notes=notes)

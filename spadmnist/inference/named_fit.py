@@ -258,7 +258,7 @@ def _by_simulation(path: ModelPath, wanted: Sequence[Candidate]) -> None:
             continue
         best = fit_trial(replicates, path.evaluation, _started(path, candidate), 5)
         best.evidence = evidence_of(replicates, path.evaluation, best)
-        if not candidate.coordinates and best.evidence <= 0:  # a switch, which is right as it is
+        if not candidate.coordinates and best.evidence < FALL_95:  # a switch that the data do not turn
             _kept(path, candidate)
             continue
         accept(path, best, math.sqrt(max(best.evidence, 0.0)))

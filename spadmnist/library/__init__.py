@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import measurement as measurements
-from .. import twin, window
+from .. import twin, units, window
 from ..config import read_sensor
 from ..errors import InputError, SpadError
 from ..factory import Progress
+from ..foreign import quoted
 from ..measurement import Measurement
 from ..plugins import check_values, discover, load_file
 from ..recording import Capture
@@ -73,6 +74,7 @@ def simulate(
     _check_seed(seed)
     model = _model(sensor, plugins, crop)
     opened = _plan(plan, model)
+    _say_notes(opened, bar.notice)
     if folder is not None:
         return measurements.open(twin.simulate(model, opened, folder, seed, bar))
     made = list(twin.twin(model, opened, seed, bar))
@@ -117,6 +119,7 @@ def compare(
     _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
     origin = _origin(sensor, data, seed)
+    _say_notes(data, bar.notice)
 
     def told(what: str, share: float) -> None:
         nonlocal done
@@ -173,6 +176,7 @@ def diagnose(
     _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
     origin = _origin(sensor, data, seed)
+    _say_notes(data, say)
     journal = None
     if keep is not None:
         check_place(keep, origin.sensor)
@@ -245,6 +249,7 @@ def fit(
     _check_seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
     origin = _origin(sensor, data, seed)
+    _say_notes(data, say)
     found = named_fit.fit_named(model, data, *lists, seed, workers, say)
     return Fit(found, model, origin)
 
@@ -261,6 +266,11 @@ def _model(sensor: Sensor | PathLike, files: Sequence[PathLike], crop: Crop | No
     if isinstance(sensor, Sensor):
         for effect in sensor.effects:
             check_values(effect)
+        if not sensor.layout.pixel_area <= units.LARGEST_PIXEL:  # also where it is not a number
+            raise InputError(
+                f"the sensor's pixel_area is {sensor.layout.pixel_area!r}; it is in m^2, 25e-12 for 25 um^2, and at "
+                f"most {units.show(units.LARGEST_PIXEL, 'm^2')}"
+            )
         model = sensor.resolved()
     elif isinstance(sensor, str | os.PathLike):
         model = read_sensor(sensor)
@@ -272,6 +282,16 @@ def _model(sensor: Sensor | PathLike, files: Sequence[PathLike], crop: Crop | No
     if not (isinstance(ends, tuple) and len(ends) == 2 and all(isinstance(part, slice) for part in ends)):
         raise InputError(f'crop is {crop!r}; it is "100:150,200:250" or (slice(100, 150), slice(200, 250))')
     return model.cropped(*ends)
+
+
+def _say_notes(measurement: Measurement, say: Callable[[str], None]) -> None:
+    """Say what is to be known of the captures' descriptions, each thing once."""
+    notes: dict[str, list[str]] = {}
+    for capture in measurement.captures:
+        for note in capture.notes:
+            notes.setdefault(note, []).append(capture.id)
+    for note, ids in notes.items():
+        say(f"Note: {', '.join(map(quoted, ids[:6]))}{', ...' if len(ids) > 6 else ''}: {note}")
 
 
 def _data(measurement: Measurement | PathLike) -> Measurement:

@@ -298,15 +298,20 @@ def _recorded(capture: recordings.Capture, layout: Layout, data: Any) -> Recordi
             raise _wrong(capture.id, "holds values other than 0 and 1; binary frames are 0 or 1")
         return Recording(capture, layout, None, np.packbits(frames.astype(np.uint8), axis=2))
     if capture.modality == "counts":
-        if frames.dtype.kind not in "ui" or frames.min() < 0 or frames.max() > c.largest_count:
+        if frames.dtype.kind not in "uif" or not np.all((frames >= 0) & (frames <= c.largest_count)):
             raise _wrong(capture.id, f"holds values that are no counts of {c.bits} bits, 0 to {c.largest_count}")
+        if frames.dtype.kind == "f" and np.any(frames != np.rint(frames)):
+            raise _wrong(capture.id, "holds counts that are no whole numbers")
         return Recording(capture, layout, None, frames.astype(np.uint16 if c.largest_count > 255 else np.uint8))
     return _first_stamps(capture, layout, frames)
 
 
 def _array(id: str, data: Any) -> np.ndarray:
+    if np.ma.is_masked(data):
+        raise _wrong(id, "has masked entries, which are no data; leave them out, or fill them (array.filled)")
     try:
-        return np.asarray(data)
+        found = np.asarray(data)
+        return found.astype(found.dtype.newbyteorder("="), copy=False)  # as kernels are compiled for
     except ValueError:
         raise _wrong(id, "has lists of several lengths; give an array") from None
 
@@ -361,7 +366,7 @@ def _stamps(capture: recordings.Capture, layout: Layout, data: Any) -> Recording
         if coarse > (tick or _FINE) / 2:
             least = units.show(coarse, "s", 2)
             raise _wrong(capture.id, f"times are {times.dtype}, which says no less than {least} apart; give float64")
-        times = times.astype(np.float64)
+    times = times if whole else times.astype(np.float64, copy=False)
     seconds = times * float(tick or 1.0) if whole else times
     if times.size and not (np.isfinite(seconds).all() and seconds.min() >= 0 and seconds.max() < end):
         first, last = units.show(float(seconds.min()), "s"), units.show(float(seconds.max()), "s")

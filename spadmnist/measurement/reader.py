@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .. import capture_files, disk, document, manifest, manifest_file, scene, tiles, units
-from ..document import Document, Path_
+from ..document import Document, Path_, path_of
 from ..effects import Conditions
 from ..errors import ConfigError, InputError
 from ..events import MOST_PIXELS, Layout
@@ -45,7 +45,7 @@ def open(path: str | Path, readout: str | None = None, planned: bool = False) ->
     all files are checked here, data are read when they are asked for. Raises ConfigError with every mistake of the
     YAML, InputError for a file that cannot be used.
     """
-    path = Path(path)
+    path = path_of(path, "a measurement")
     folder, file = (path, path / FILE) if path.is_dir() else (path.parent, path)
     if path.is_dir() and not file.exists():
         if (path / manifest_file.MANIFEST).exists():
