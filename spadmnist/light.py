@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from . import units
-
 PLANCK = 6.62607015e-34  # J s, exact (SI 2019)
 SPEED_OF_LIGHT = 299792458.0  # m/s, exact
 LUMINOUS_EFFICACY = 683.0  # lm/W at 555 nm (paper, eq. 2)
@@ -22,7 +20,7 @@ def of_lux(wavelength: float) -> str | None:
         return None
     return (
         "lux is turned into power with 683 lm/W, which holds at 555 nm, not at "
-        f"{units.show(wavelength, 'm')}; give irradiance where the light is not green"
+        f"{wavelength * 1e9:.4g} nm; give irradiance where the light is not green"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -545,10 +546,30 @@ def test_what_a_transfer_leaves_at_the_end(tmp_path: Path, rows: int, columns: i
 
 
 @pytest.mark.parametrize(
+    ("dtype", "most", "said", "note"),
+    [
+        (np.uint8, 1, {}, "each of its bytes is 0 or 1; .* add --bits 1"),
+        (np.uint8, 1, {"bits": 1}, ""),
+        (">u2", 9, {"bits": 12}, "each of its counts is a multiple of 256"),
+        ("<u2", 9, {"bits": 12}, ""),
+        (np.uint8, 255, {}, ""),
+    ],
+)
+def test_raw_frames_of_another_form_are_doubted(tmp_path: Path, dtype: Any, most: int, said: Any, note: str) -> None:
+    frames = np.random.default_rng(1).integers(0, most + 1, (40, 8, 8)).astype(dtype)
+    (tmp_path / "a.raw").write_bytes(frames.tobytes())
+    clock = replace(CLOCK, rows=8, columns=8, **said)
+    found = import_files([tmp_path / "a.raw"], tmp_path / "out", clock, DARK)
+    assert bool(found.notes) == bool(note) and re.search(note, "".join(found.notes))
+    if said == {"bits": 1}:
+        assert measurement.open(tmp_path / "out")["a"].counts.sum() == frames.sum()
+
+
+@pytest.mark.parametrize(
     ("size", "said", "says"),
     [
         (24, {"rows": 3, "columns": 16, "modality": "counts"}, "does not say how many bits a count has"),
-        (24, {"rows": 3, "columns": 16, "bits": 1}, "bits, eight to a byte, are no counts"),
+        (24, {"rows": 3, "columns": 16, "bits": 1}, "no whole frames of 3 x 16 counts of 1 bits (48 bytes each)"),
         (24, {"rows": 3, "columns": 16, "bits": 8, "packed": True}, "leave out --packed or --bits"),
         (25, {"rows": 3, "columns": 16}, "no whole frames of 3 x 16 bits (6 bytes each)"),
         (25, {"rows": 3, "columns": 4, "bits": 12}, "no whole frames of 3 x 4 counts of 12 bits (24 bytes each)"),

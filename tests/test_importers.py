@@ -473,7 +473,7 @@ def test_a_raw_file_of_a_spad512(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "said", "says"),
     [
-        ("a.npy", lambda p: np.save(p, np.array([{}], object)), CLOCK, "damaged"),
+        ("a.npy", lambda p: np.save(p, np.array([{}], object)), CLOCK, "holds Python objects"),
         ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), 0.5)), replace(CLOCK, bits=3), "on hold 0.5"),
         ("a.npy", lambda p: np.save(p, np.full((2, 3, 4), np.nan)), replace(CLOCK, bits=3), "on hold nan"),
         ("a.npy", lambda p: np.save(p, np.zeros((2, 3, 4), complex)), CLOCK, "complex128"),

@@ -597,3 +597,85 @@ def test_one_recording_does_not_count_as_two(modality: str) -> None:
     twice = sp.Measurement.from_arrays(sensor().layout, {one: data, other: its_own, two: data})
     with pytest.raises(InputError, match=r"two: has the same detections as one, one by one; .* leave one of the capt"):
         sp.compare(sensor(), twice, jobs=1)
+
+
+def stamps_of(model: sp.Sensor) -> tuple[sp.Capture, np.ndarray, np.ndarray]:
+    """A capture of time stamps, and its arrays."""
+    capture = sp.Capture("flat", "tr", **LIGHT, exposure=5e-3)
+    events = sp.simulate(model, [capture], seed=1)["flat"].events
+    return capture, events.times, events.rows
+
+
+@pytest.mark.parametrize("kind", [">f8", "longdouble"])
+def test_times_of_any_kind_are_compared(kind: str) -> None:
+    capture, times, pixels = stamps_of(sensor())
+    data = sp.Measurement.from_arrays(sensor().layout, {capture: (times.astype(kind), pixels.astype(">i4"))})
+    assert sp.compare(sensor(), data, jobs=1).verdict == "adequate"
+
+
+def test_what_is_masked_is_no_data() -> None:
+    capture, times, pixels = stamps_of(sensor())
+    hidden = np.ma.masked_array(times, mask=np.arange(times.size) < 40)
+    with pytest.raises(InputError, match=r"flat.*masked entries"):
+        sp.Measurement.from_arrays(sensor().layout, {capture: (hidden, pixels)})
+    frames = np.ma.masked_array(np.ones((40, 3, 5), bool), mask=np.zeros((40, 3, 5), bool))
+    assert sp.Measurement.from_arrays(sensor().layout, {FLAT: frames})["flat"].counts.sum() == 600  # nothing is hidden
+    rate = np.ma.masked_array(np.full(15, 1e6), mask=np.arange(15) < 8)
+    masked = sp.Sensor(sensor().layout, [sp.effects.DarkCounts(rate=rate)], rules="device")
+    with pytest.raises(InputError, match=r"dark_counts\.rate has masked pixels"):
+        sp.simulate(masked, [sp.Capture("dark", "tr", dark=True, exposure=1e-3)])
+
+
+def test_counts_may_be_floats_that_are_whole() -> None:
+    capture = sp.Capture("c", "counts", dark=True, frames=45, frame_time=1e-5, bits=4)
+    data = sp.Measurement.from_arrays(sensor().layout, {capture: np.full((3, 3, 5), 3.0)})
+    assert data["c"].frames.dtype == np.uint8 and data["c"].counts.sum() == 135
+    with pytest.raises(InputError, match="no whole numbers"):
+        sp.Measurement.from_arrays(sensor().layout, {capture: np.full((3, 3, 5), 3.5)})
+
+
+@pytest.mark.parametrize("area", [25.0, math.nan])
+def test_a_pixel_area_in_another_unit_is_refused(area: float) -> None:
+    large = sp.Sensor(sp.Layout(3, 5, area, 1.0), [sp.effects.Detection(pdp=0.4)], rules="device")
+    with pytest.raises(InputError, match="it is in m\\^2, 25e-12 for 25 um\\^2, and at most 100 mm\\^2"):
+        sp.simulate(large, [FLAT])
+
+
+def test_a_map_that_is_not_relative_is_refused() -> None:
+    """A measured map as it is, in counts; of factors that scatter about 1 some may be beyond what is possible."""
+    layout = sensor().layout
+    with pytest.raises(SpadError, match="divide a measured map by its median"):
+        sp.simulate(sp.Sensor(layout, [sp.effects.Detection(pdp=0.4, relative=np.arange(15.0) + 100)]), [FLAT])
+    assert sp.simulate(sp.Sensor(layout, [sp.effects.Detection(pdp=0.9, relative=np.linspace(0.7, 1.3, 15))]), [FLAT])
+
+
+def test_lux_of_light_that_is_not_green_is_said() -> None:
+    said: list[str] = []
+    red = sp.Capture("red", "qis", lux=1e-3, wavelength=700e-9, frames=40, frame_time=10e-6)
+    sp.simulate(
+        sensor(), [red, sp.Capture("green", "qis", lux=1e-3, frames=40, frame_time=10e-6)], progress=said.append
+    )
+    (note,) = [line for line in said if "lux" in line]
+    assert note.startswith("Note: red: lux is turned into power with 683 lm/W, which holds at 555 nm, not at 700 nm")
+
+
+def test_more_frames_than_memory_holds_is_a_sentence() -> None:
+    with pytest.raises(InputError, match=r"f: its 1,000,000,000,000 frames of 3 x 5 pixels take .* shorten it"):
+        sp.simulate(sensor(), [sp.Capture("f", "qis", dark=True, frames=10**12, frame_time=1e-5)])
+
+
+def test_a_value_that_cannot_be_is_shown_all_the_same() -> None:
+    assert "{5e-07: 0.4}" in repr(sp.Sensor(sensor().layout, [sp.effects.Detection(pdp={500e-9: 0.4})]))
+    for call in (sp.read_sensor, sp.open_measurement):
+        with pytest.raises(InputError, match="None is of type NoneType; give the path of"):
+            call(None)
+
+
+@pytest.mark.slow
+def test_a_switch_of_which_the_data_say_nothing_stays() -> None:
+    """At 150 detections per pixel and second no pixel fires within a dead time."""
+    model = sensor()
+    capture, times, pixels = stamps_of(model)
+    data = sp.Measurement.from_arrays(model.layout, {capture: (times, pixels)})
+    found = sp.fit(model, data, free=["dead_time.paralyzable"], jobs=1)
+    assert not found.values and not found.model.effect("dead_time").paralyzable

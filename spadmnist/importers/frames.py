@@ -276,8 +276,8 @@ class Raw(Format):
     """Raw frames as a camera's memory holds them, 512 x 512 where nothing else is said, row after row.
 
     Bits, eight columns to a byte, the high bit the left pixel (--bit-order little: the low bit); with --bits counts of
-    so many bits, a byte each (--bits 1: 0 or 1), above 8 bits two with the low byte first. Four bytes `DONE` at the end,
-    which a transfer over the network leaves, are passed over. Frames are not turned.
+    so many bits, a byte each (--bits 1: 0 or 1), above 8 bits two with the low byte first. Four bytes `DONE` at the
+    end, which a transfer over the network leaves, are passed over. Frames are not turned.
 
     Source: public readers of the SPAD512 and SPAD512S agree on this order; no document of its maker was at hand.
     """
