@@ -335,6 +335,27 @@ def test_a_number_that_nothing_follows_stays_as_it_is():
     assert np.log(found.values["any", "a"] / 0.01) == pytest.approx(-0.5, abs=5 * 0.5 / np.sqrt(30))
 
 
+def test_a_number_at_the_end_of_its_range_leaves_the_others_where_they_fit_best():
+    """Of two that are correlated; the best value of the first lies four of its errors beyond the end."""
+    rng = np.random.default_rng(0)
+    lifetime, chance = (
+        Coordinate("any", name, "", low, high, off)
+        for name, low, high, off in (("lifetime", 5e-9, 5e-7, None), ("probability", 1e-4, 0.1, 0.0))
+    )
+    one, other = np.linalg.qr(rng.standard_normal((200, 2)))[0].T
+    jacobian = np.stack([10 * one, 40 * (0.8 * one + 0.6 * other)], axis=1)
+    there = np.array([lifetime.ends[1], math.log(5e-3)])
+    beyond = jacobian @ np.array([-0.4, 0.0])  # residuals at `there`
+    moved = -float(jacobian[:, 1] @ beyond) / float(jacobian[:, 1] @ jacobian[:, 1])
+    cell = ("flat", "intervals")
+    values = {lifetime.key: 5e-7, chance.key: math.exp(there[1])}
+    evaluation = Evaluation({}, None, {}, {}, {}, {}, {cell: beyond}, {cell: rng.standard_normal((96, 200))}, {})
+    before = Fit((lifetime, chance), there, np.eye(2), {cell: beyond}, {cell: jacobian}, 0.0, dict(values))
+    found = gauss_newton_step(None, evaluation, (lifetime, chance), values, lambda v: v, JacobianBy(before=before))
+    assert found.values[lifetime.key] == pytest.approx(5e-7)
+    assert found.point[1] - there[1] == pytest.approx(moved) and found.square < float(beyond @ beyond)
+
+
 PLAN = """format: spadmnist-measurement/1
 name: lab
 layout: {rows: 8, columns: 8}
