@@ -324,6 +324,8 @@ class Sensor:
 
     def rates(self, photons: np.ndarray, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """(rate of all avalanches' seeds, the light's part), 1/s, from photons/s; each (images, pixels)."""
+        if not self._resolved:
+            return self.resolved().rates(photons, conditions)
         photons, conditions = conditions.lit(photons)
         if self.chip is not None and self.window is not None:
             # by this very rule: one that a subclass has set is upon what it finds here
@@ -350,6 +352,8 @@ class Sensor:
         stamped: time stamps are recorded, of which a readout may lose some; otherwise each pixel counts for itself.
         first: of each frame the first detection alone is recorded; under `rules: device` it alone reaches other pixels.
         """
+        if not self._resolved:
+            return self.resolved().expected(photons, conditions, stamped, first)
         photons, conditions = conditions.lit(photons)
         if self.chip is not None and self.window is not None:
             if self._apart is not None:
