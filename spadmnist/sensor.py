@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from . import hooks, kernels, units
+from . import gates, hooks, kernels, units
 from .effects import Chip, Conditions, Effect, in_order
 from .effects.afterpulsing import Afterpulsing
 from .effects.dead_time import DeadTime
@@ -347,8 +347,6 @@ class Sensor:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Expected (candidates before the dead time, recorded detections) per pixel; shapes as `photons`.
 
-        Where the dead time is no shorter than a gate is open, the detections are rough.
-
         stamped: time stamps are recorded, of which a readout may lose some; otherwise each pixel counts for itself.
         first: of each frame the first detection alone is recorded; under `rules: device` it alone reaches other pixels.
         """
@@ -368,9 +366,9 @@ class Sensor:
         on_average = rate
         for effect in self.at("gate"):
             on_average = hooks.expected(effect, on_average, conditions)
-        # Where all detections count, the dead time is that at the rate while the gate is open. Of a frame that records
-        # its first event alone, the number of events in it counts.
-        opened: Any = 1.0
+        # Where all detections count, they are those of an opening. Of a frame that records its first event alone, the
+        # number of events in it counts.
+        opened: np.ndarray | None = None  # the share of the time
         if first:
             rate = on_average
         elif on_average is not rate:
@@ -381,10 +379,17 @@ class Sensor:
             else:
                 rate = hooks.expected(effect, rate, conditions)
         candidates = rate
-        for stage in ("dead_time", "timing", "readout") if stamped else ("dead_time",):
+        for effect in self.at("dead_time"):
+            rate = hooks.expected(effect, rate, conditions)
+        if opened is not None and self.at("dead_time"):
+            rate = gates.detected(
+                candidates, rate, opened * conditions.live_time / conditions.frames, conditions, self.extends
+            )
+        for stage in ("timing", "readout") if stamped else ():
             for effect in self.at(stage):
                 rate = hooks.expected(effect, rate, conditions)
-        return candidates * opened * conditions.live_time, rate * opened * conditions.live_time
+        live = conditions.live_time if opened is None else opened * conditions.live_time
+        return candidates * live, rate * live
 
     def _reached(self, effect: Effect, rate: np.ndarray, conditions: Conditions, first: bool) -> np.ndarray:
         """What an effect causes in other pixels where recorded detections cause it alone, and these do, too; 1/s."""

@@ -34,7 +34,7 @@ LAYERS = [
     {"hooks", "reconstruct", "statistics", "capture_files"},
     {"line"},
     {"sensor"},
-    {"lazy", "standing"},
+    {"gates", "lazy", "standing"},
     {"experiment", "signatures"},
     {"config"},
     {"identity", "manifest", "sensor_file"},

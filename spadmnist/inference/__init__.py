@@ -31,6 +31,7 @@ conclusion, findings, next_step   the verdict, what remains, what to do with the
 results                           the answer as JSON, for a terminal, for the next sensor file
 named_fit                         `fit`: named parameters
 exact_likelihood, point_process   fits without simulation, where the likelihood has a closed form
+bounded_step                      the highest point of a parabola within bounds
 profile_likelihood                its maximum, and where it has fallen by a given amount
 budget, journal                   how much work a search may do; its replicates on disk, from which it goes on
 replicate_cache, own_code         replicates that are kept for another measurement; the user's code that made them

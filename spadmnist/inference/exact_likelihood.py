@@ -22,9 +22,9 @@ from ..recording import Capture, Recording
 from ..sensor import Sensor
 from .candidates import Candidate, templates, with_values
 from .closed_forms import closed_form, level_for
-from .coordinates import Coordinate, Key
+from .coordinates import Coordinate, Key, point_of
 from .levels import FALL_95
-from .point_process import BYTES_OF_A_GAP, DENSE, Bits, Law, Stamps, TooManyGaps, blur_of, hazards_of
+from .point_process import BYTES_OF_A_GAP, DENSE, MANY, Bits, Law, Stamps, TooManyGaps, blur_of, hazards_of
 from .profile_likelihood import by_simplex, maximum, profile_end
 
 # fall of twice the log-likelihood at the ends of a 95 % interval, of an edge sharper than the intervals are dense: its
@@ -35,9 +35,10 @@ EDGE_FALL = 5.99
 _FAR = 100.0
 # of the log-likelihood: a value that is higher by more shows that a maximum is none; a rule of thumb
 _HIGHER = 0.05
-_MAXIMA = (
-    4  # maxima, each found on the way along the last one's profiles, after which there are too many; a rule of thumb
-)
+# maxima, each found on the way along the profiles of the one before, after which there are too many; a rule of thumb
+_MAXIMA = 4
+_LEAST_SCALE = 1e-3  # of a coordinate: the least distance at which a maximum is looked for; a rule of thumb
+_LEFT_OUT = 0.2  # of the time stamps, in pixels with few: with more the model is fitted by simulation; a rule of thumb
 # tolerances of `by_simplex`: of its first size, and of the log-likelihood; near enough for a parabola, a rule of thumb
 _ROUGH = 0.3, 0.5
 # bytes of the time stamps and gaps of all captures, at most; more is fitted by simulation. Chosen so that they and the
@@ -54,16 +55,16 @@ class MaximumLikelihood:
 
     Attributes:
         values, intervals: by (effect, parameter), SI.
-        likelihood_ratios: twice the log-likelihood ratio of each change, the others fitted again without it.
         value: of the log-likelihood.
+        own: every pixel of every capture had a rate of its own.
         free: the fitted parameters.
         correlations: (n, n) of these, by the curvature at the maximum.
     """
 
     values: dict[Key, float]
     intervals: dict[Key, tuple[float, float]]
-    likelihood_ratios: list[float]
     value: float
+    own: bool
     free: tuple[Key, ...]
     correlations: np.ndarray
 
@@ -157,6 +158,13 @@ class Likelihood:
             any(not np.array_equal(s.dead_times, sensors[0].dead_times) for s in sensors[1 + 2 * i : 3 + 2 * i])
             for i in range(len(u))
         ]
+
+    @property
+    def left_out(self) -> float:
+        """The share of the time stamps that lie in pixels with few of them, which tell nothing where rates are free."""
+        counts = [law.counts for law in self.laws if isinstance(law, Stamps)]
+        whole = sum(int(one.sum()) for one in counts)
+        return sum(int(one[one < MANY].sum()) for one in counts) / max(whole, 1)
 
     def fall(self, i: int, u: np.ndarray) -> float:
         """The fall of twice the log-likelihood at the ends of a coordinate's 95 % interval.
@@ -298,7 +306,7 @@ def _maximum(
     Args:
         values: of the parameters where nothing better is known.
     """
-    sensor, coordinates, fixed = function.sensor, function.coordinates, function.fixed
+    coordinates, fixed = function.coordinates, function.fixed
     ends = np.array([d.ends for d in coordinates]).T
     given = {d.key: float(values[d.key]) for d in coordinates}
     widths = {d.key: 0.3 if d.log else 0.1 * (d.ends[1] - d.ends[0]) for d in coordinates}
@@ -309,6 +317,8 @@ def _maximum(
     function.begin(placed({**given, **(start or {})}))
     if mapped and not function.own:
         raise NoLikelihood("maps together with parameters that change the rates")
+    if function.own and function.left_out > _LEFT_OUT:
+        raise NoLikelihood("pixels with few time stamps each")
     top = None
     if start is not None:
         u, scales = placed({**given, **start}), {**widths, **(errors or {})}
@@ -340,29 +350,42 @@ def _maximum(
     best, u = top.value, top.u
     intervals = {d.key: d.interval(*profile) for d, profile in zip(coordinates, profiles, strict=True)}
     found = {d.key: d.value(float(x)) for d, x in zip(coordinates, u, strict=True)}
-    likelihood_ratios = []
-    for candidate in candidates:
-        own = {*dict(candidate.fixed), *(d.key for d in candidate.coordinates)}
-        some = [i for i, d in enumerate(coordinates) if d.key not in own]
-        rest = {key: value for key, value in fixed.items() if key not in own}
-        without = Likelihood(sensor, data, [coordinates[i] for i in some], rest)
-        without.begin(u[some])
-        without.own = function.own
-        # the others take up what they can of it
-        lower = without(u[some])
-        if some:
-            other = maximum(without, u[some], top.spreads[some], ends[:, some])
-            assert other is not None
-            lower = max(other.value, without.highest[0])
-        likelihood_ratios.append(2 * (best - lower))
     inverse = np.linalg.inv(top.curved)
     # of some coordinates the value falls as they rise
     spread = np.sqrt(np.diag(inverse)) * [-1.0 if d.lacks else 1.0 for d in coordinates]
     return MaximumLikelihood(
         values={**fixed, **found},
         intervals=intervals,
-        likelihood_ratios=likelihood_ratios,
         value=best,
+        own=function.own,
         free=tuple(found),
         correlations=inverse / np.outer(spread, spread),
     )
+
+
+def likelihood_ratios(
+    sensor: Sensor, data: Sequence[Recording], candidates: Sequence[Candidate], found: MaximumLikelihood
+) -> list[float]:
+    """Twice the log-likelihood ratio of each change, the others fitted again without it.
+
+    Args:
+        sensor, data, candidates: as in `maximise`, which returned `found`.
+    """
+    out = []
+    for candidate in candidates:
+        own = {*dict(candidate.fixed), *(d.key for d in candidate.coordinates)}
+        others = [d for other in candidates for d in other.coordinates if d.key not in own]
+        fixed = {key: value for other in candidates for key, value in other.fixed if key not in own}
+        without = Likelihood(sensor, data, others, fixed)
+        u = point_of(others, found.values)
+        without.begin(u)
+        without.own = found.own
+        lower = without(u)
+        if others:  # they take up what they can of it
+            scales = np.array([max(d.error(*found.intervals[d.key]), _LEAST_SCALE) for d in others])
+            ends = np.array([d.ends for d in others]).T
+            top = maximum(without, u, scales, ends)
+            assert top is not None
+            lower = max(top.value, without.highest[0])
+        out.append(2 * (found.value - lower))
+    return out

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .bounded_step import bounded_step
 from .capture_replicates import CannotSimulate
 from .coordinates import Coordinate, Key, point_of
 from .evaluation import Evaluation, stacked
@@ -35,7 +36,6 @@ _VAIN = 2  # steps in a row without a fall, the second one shorter, after which 
 # squared norm of a column of the Jacobian below which the coordinate is not informed, with a standard error above 4.5:
 # it then stays where it is, and its error is infinite
 _BLIND = 0.05
-_SINGULAR = 1e-10  # of the largest eigenvalue of J^T J: a smaller one is rounding, and nothing moves along it
 
 
 @dataclass
@@ -198,26 +198,14 @@ def gauss_newton(
 
 
 def _downhill(normal: np.ndarray, gradient: np.ndarray, coordinates: Sequence[Coordinate], u: np.ndarray) -> np.ndarray:
-    """The step to the least squares within the search ranges, (coordinates,).
-
-    Where a coordinate would leave its range it stays at the end, and the others have their best values beside it.
+    """The step to the least squares within the search ranges, (coordinates,); one that is not informed stays.
 
     Args:
         normal: J^T J; gradient: J^T z.
         u: (coordinates,) the point.
     """
     ends = np.array([d.ends for d in coordinates]).reshape(-1, 2).T
-    step, free = np.zeros(len(u)), np.ones(len(u), bool)
-    while free.any():
-        left = gradient + normal[:, ~free] @ step[~free]
-        step[free] = -np.linalg.pinv(normal[np.ix_(free, free)], rcond=_SINGULAR) @ left[free]
-        inside = np.clip(u + step, *ends) - u
-        out = free & (np.abs(inside - step) > 1e-12)
-        step = np.where(out, inside, step)
-        if not out.any():
-            break
-        free &= ~out
-    return step
+    return bounded_step(-gradient, normal, u, ends, np.diag(normal) >= _BLIND)
 
 
 def _points_aside(

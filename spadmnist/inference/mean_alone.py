@@ -22,6 +22,7 @@ from .replicates import simulated
 # events of each of so many recordings of frames, by which the closed form of their mean is corrected: together they
 # have the noise of 1e6 counts, 0.1 %, in some tenths of a second
 _SHORT, _RECORDINGS = 1.25e5, 8
+_MOST = 20.0  # as many times as many are still simulated, where one frame holds them; some seconds, a rule of thumb
 _STAMPS = 300  # of a pixel: the first one comes too early by up to a dead time, 0.04 % of all counts at most
 _MOMENTS, _PIXELS = 1024, 1024  # moments and pixels over which a curve of the rate is averaged, at most
 _FEWEST = 16  # moments of an array that has too many pixels for the others
@@ -63,19 +64,11 @@ def _is_bent(sensor: Sensor, capture: Capture, level: float) -> bool:
     Where all detections are counted, the mean rate alone matters, unless a dead time loses a part of them.
     """
     sensor = InTheDark.of(sensor) if capture.light.dark else sensor
-    if not (sensor.at("arrival") or _is_unsaid(sensor, capture)):
+    if not sensor.at("arrival") and all(effect.states_mean for effect in sensor.effects):
         return False
     if not capture.counts_events:
         return True
-    light = np.full((1, sensor.layout.pixels), level)
-    events, counted = (float(part.sum()) for part in sensor.expected(light, capture.conditions, stamped=False))
-    return counted < events * (1 - CLOSED)
-
-
-def _is_unsaid(sensor: Sensor, capture: Capture) -> bool:
-    """Whether an effect changes the mean unsaid. A counter's gate does: its pixels open without a dead time."""
-    gated = capture.counts_events and capture.modality == "counts" and bool(sensor.at("gate"))
-    return gated or not all(effect.states_mean for effect in sensor.effects)
+    return _lost(sensor, capture, level) > CLOSED
 
 
 def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[float, float]:
@@ -88,12 +81,14 @@ def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[fl
     curves = [effect for effect in sensor.at("arrival") if hasattr(effect, "factor")]
     apart, c = _of_curves(sensor, curves, capture, level), capture.conditions
     steady = sensor.changed(effects=[effect for effect in sensor.effects if effect not in curves])
-    steady = InTheDark.of(steady) if capture.light.dark else steady
-    if not (steady.at("arrival") or _is_unsaid(steady, capture)):
+    if not steady.at("arrival") and all(effect.states_mean for effect in steady.effects):
         return apart, 0.0
-    events = float(steady.expected(np.full((1, sensor.layout.pixels), level), c)[0].sum())
+    if steady.layout.pixels > _PIXELS and c.scene is None:
+        steady = _part(steady)
+    steady = InTheDark.of(steady) if capture.light.dark else steady
+    events = float(steady.expected(np.full((1, steady.layout.pixels), level), c)[0].sum())
     # a pixel begins without a dead time, which must matter to none of many stamps
-    least = _SHORT if capture.modality != "tr" else max(_SHORT, _STAMPS * sensor.layout.pixels)
+    least = _SHORT if capture.modality != "tr" else max(_SHORT, _STAMPS * steady.layout.pixels)
     share = min(least / max(events, 1.0), 1.0)
     frames = max(math.ceil(c.frames * share), 1)
     clock = replace(c, frames=frames, exposure=frames * c.frame_period)
@@ -104,10 +99,26 @@ def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[fl
     if not capture.counts_events:  # a sum of frames has as many
         short = replace(short, modality="qis", conditions=replace(clock, bits=0))
     numbers = np.arange(_RECORDINGS, dtype=np.uint64)
+    if events * frames / c.frames > _MOST * _SHORT:  # one frame holds so many
+        return apart, _lost(steady, capture, level)
     made = simulated(steady, short, np.full(_RECORDINGS, level), numbers, 0)
     logs = np.log([max(float(recording.totals.sum()), 0.5) for recording in made])
     apart += float(logs.mean()) - math.log(closed_form(steady, short)(level))
     return apart, float(np.std(logs, ddof=1)) / math.sqrt(_RECORDINGS)
+
+
+def _part(sensor: Sensor) -> Sensor:
+    """About so many pixels of a sensor as are simulated: whole rows, or a part of the first one."""
+    rows, columns = sensor.layout.shape
+    some = max(_PIXELS // columns, 1)
+    return sensor.cropped(slice(0, min(some, rows)), slice(0, min(columns, _PIXELS)))
+
+
+def _lost(sensor: Sensor, capture: Capture, level: float) -> float:
+    """The share of the events that are not detected: no correction is larger."""
+    light = np.full((1, sensor.layout.pixels), level)
+    events, counted = (float(part.sum()) for part in sensor.expected(light, capture.conditions, stamped=False))
+    return max(1 - counted / max(events, 1.0), 0.0)
 
 
 def _of_curves(sensor: Sensor, curves: Sequence[Effect], capture: Capture, level: float) -> float:
@@ -129,7 +140,9 @@ def _of_curves(sensor: Sensor, curves: Sequence[Effect], capture: Capture, level
         swing = swing + share * (factor / factor.mean() - 1)
     factors = np.maximum(1 + swing, 0.0)
     if capture.counts_events:
-        steady = sensor.expected(light, c, stamped=False)[0] / c.live_time
+        # what share of the time a gate is open is the same for both
+        open_ = sensor.changed(effects=[effect for effect in sensor.effects if effect not in sensor.at("gate")])
+        steady = open_.expected(light, c, stamped=False)[0] / c.live_time
         there, mean = (_counted(sensor, steady * by, c) for by in (factors, np.ones((1, 1))))
     else:
         events = events_in_frames(sensor, light, capture.conditions)[0, some]

@@ -23,7 +23,7 @@ from .capture_replicates import CannotSimulate
 from .comparison import comparison_with
 from .coordinates import Coordinate, Key, point_of
 from .evidence import evidence_of
-from .exact_likelihood import MaximumLikelihood, NoLikelihood, maximise, recordings
+from .exact_likelihood import MaximumLikelihood, NoLikelihood, likelihood_ratios, maximise, recordings
 from .findings import nuisances, remainder, traces
 from .gauss_newton import JacobianBy, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
@@ -94,8 +94,9 @@ def fit_named(
         start, wrong = path.evaluation, bool(path.failed)
         say("fitting " + ", ".join(title(candidate) for candidate in wanted))
         exact: MaximumLikelihood | None = None
+        ratios: list[float] = []
         try:
-            wanted, exact = _maximum_likelihood(measurement, replicates, wanted)
+            wanted, exact, ratios = _maximum_likelihood(measurement, replicates, wanted)
         except NoLikelihood as error:  # it holds the recordings, whose memory the replicates need
             ways = sorted({_method(candidate) for candidate in wanted})
             misfit = "" if ways == ["simulation"] else ", the misfit by simulation"
@@ -103,7 +104,7 @@ def fit_named(
         if exact is None:
             _by_simulation(path, wanted)
         else:
-            _by_likelihood(path, wanted, exact)
+            _by_likelihood(path, wanted, exact, ratios)
         scale_errors(path)
         null_95 = time_blocks.measure(replicates, path.ladder)
         right = "explained" if wrong else "adequate"
@@ -139,8 +140,10 @@ def fit_named(
 
 def _maximum_likelihood(
     measurement: Measurement, replicates: Replicates, wanted: list[Candidate]
-) -> tuple[list[Candidate], MaximumLikelihood]:
-    """(the wanted changes, their maximum-likelihood fit to all captures); raises NoLikelihood where there is none.
+) -> tuple[list[Candidate], MaximumLikelihood, list[float]]:
+    """(the wanted changes, their maximum-likelihood fit to all captures, twice the log-likelihood ratio of each).
+
+    Raises NoLikelihood where there is none.
 
     The search range of a parameter is where a diagnosis looks for it, and no bound: a value at its end has a wider one.
     """
@@ -153,12 +156,15 @@ def _maximum_likelihood(
         wider = [_further(candidate, found) for candidate in wanted]
         if wider == wanted:
             break
-        again = maximise(replicates.start, data, wider)
+        try:
+            again = maximise(replicates.start, data, wider)
+        except NoLikelihood:  # none so far off
+            break
         at_end = [_further(candidate, again) for candidate in wider] != wider
         if at_end and 2 * (again.value - found.value) < FALL_95:
             break  # as good as before: the data do not say how far beyond it lies
         wanted, found = wider, again
-    return wanted, found
+    return wanted, found, likelihood_ratios(replicates.start, data, wanted, found)
 
 
 def _further(candidate: Candidate, found: MaximumLikelihood) -> Candidate:
@@ -213,10 +219,16 @@ def _covariance(path: ModelPath, exact: MaximumLikelihood | None) -> tuple[list[
     return [".".join(free[i]) for i in at], correlations[np.ix_(at, at)] * np.outer(errors, errors)
 
 
-def _by_likelihood(path: ModelPath, wanted: Sequence[Candidate], exact: MaximumLikelihood) -> None:
-    """Add steps with the maximum-likelihood values; their misfit is that of a simulation."""
+def _by_likelihood(
+    path: ModelPath, wanted: Sequence[Candidate], exact: MaximumLikelihood, ratios: Sequence[float]
+) -> None:
+    """Add steps with the maximum-likelihood values; their misfit is that of a simulation.
+
+    Args:
+        ratios: twice the log-likelihood ratio of each change.
+    """
     replicates, before = path.replicates, path.evaluation
-    for candidate, likelihood_ratio in zip(wanted, exact.likelihood_ratios, strict=True):
+    for candidate, likelihood_ratio in zip(wanted, ratios, strict=True):
         intervals = {d.key: exact.intervals[d.key] for d in candidate.coordinates}
         own = {**dict(candidate.fixed), **{key: exact.values[key] for key in intervals}}
         signature = signature_of_totals(replicates, before, before.sensors.changed(own))

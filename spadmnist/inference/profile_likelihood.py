@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
+from .bounded_step import bounded_step
+
 # of the log-likelihood: with a smaller change it does not depend on a coordinate, which then has no interval; far below
 # what moves an interval, a rule of thumb
 _NOTHING = 1e-5
@@ -166,21 +168,6 @@ def _parabola(
     )
 
 
-def _move(gradient: np.ndarray, curved: np.ndarray, free: np.ndarray, u: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """The move to the maximum of a parabola, (n,), in the free coordinates, within bounds."""
-    move, free = np.zeros(len(u)), free.copy()
-    while free.any():
-        held = gradient - curved[:, ~free] @ move[~free]
-        move[free] = np.linalg.solve(curved[np.ix_(free, free)], held[free])
-        inside = np.clip(u + move, *ends) - u
-        out = free & (np.abs(inside - move) > _TINY)
-        move = inside
-        if not out.any():
-            break
-        free &= ~out
-    return move
-
-
 def maximum(
     function: Callable[[np.ndarray], float],
     u: np.ndarray,
@@ -200,7 +187,7 @@ def maximum(
     for _ in range(8):
         top = _parabola(function, u, value, scales, ends)
         some = top.informed
-        move = _move(top.jacobian, top.curved, some, u, ends)
+        move = bounded_step(top.jacobian, top.curved, u, ends, some)
         if 0.5 * top.jacobian @ move > most:
             return None
         # far away it is no parabola
@@ -267,7 +254,7 @@ def profile_end(
                 aside = there.copy()
                 aside[j] += step
                 gradient[j] = (function(aside) - value) / step + 0.5 * curved[j, j] * step
-            move = _move(gradient, curved, others, there, ends)
+            move = bounded_step(gradient, curved, there, ends, others)
             next_ = there + move
             hoped = float(gradient @ move - 0.5 * move @ curved @ move)
             if hoped < 0.01:
