@@ -471,7 +471,7 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     usual, fit = dict(step.values), path.values[DURATION]
     check = SimpleNamespace(cell=("flat", "edge_intervals"))
     monkeypatch.setattr(ModelPath, "failed", property(lambda self: [] if self.evaluation is evaluation else [check]))
-    exact = MaximumLikelihood({DURATION: 50e-9}, {DURATION: (49e-9, 51e-9)}, [1.0], (DURATION,), np.eye(1))
+    exact = MaximumLikelihood({DURATION: 50e-9}, {DURATION: (49e-9, 51e-9)}, 0.0, False, (DURATION,), np.eye(1))
     monkeypatch.setattr("spadmnist.inference.intervals.maximise", lambda *_, **__: exact)
     sharpen(path, data)
     assert bool(path.failed) != rival and (path.evaluation is evaluation) == rival

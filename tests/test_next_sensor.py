@@ -46,7 +46,7 @@ def step(kind: str, effect: str, parameter: str | None = None, **values: Value) 
 @pytest.fixture
 def diagnosed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """`sp.diagnose` of a sensor file, whose search is replaced by an answer; what is done meanwhile."""
-    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None))
+    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None, captures=()))
     (tmp_path / "sensor.yaml").write_text(SENSOR)
 
     def diagnose(found: results.Diagnosis, meanwhile: Callable[[], None] = lambda: None, **options: Any) -> Any:

@@ -474,7 +474,7 @@ def test_the_command_writes_it_and_says_before_the_work_that_it_cannot(
         return answer_of(**BARE | {"verdict": "adequate"})
 
     monkeypatch.setattr(model_selection, "diagnose", diagnose)
-    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None))
+    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None, captures=()))
     sensor = str(Path(__file__).parents[1] / "configs" / "spad23.yaml")
     folder = tmp_path / "next"
     told = CliRunner().invoke(cli.cli, ["diagnose", sensor, "lab", "-o", str(folder)])

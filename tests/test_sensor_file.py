@@ -189,7 +189,7 @@ def answered(folder: Path, monkeypatch: pytest.MonkeyPatch, values: dict[Any, An
     lists: list[Any] = [[], [], [], [], [], [], []]
     found = Diagnosis("small", "lab", "explained" if options else "adequate", 1.0, 1.0, 1.2, *lists, values=values)
     monkeypatch.setattr(model_selection, "diagnose", lambda *_, **__: found)
-    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None))
+    monkeypatch.setattr(measurement, "open", lambda path: SimpleNamespace(file=None, captures=()))
     (folder / "lab").mkdir()
     asked = ["diagnose", str(sensor_in(folder, 16, 16)), str(folder / "lab"), "-o", str(folder / "next")]
     return CliRunner().invoke(cli.cli, [*asked, *options, "--json", str(folder / "answer.json")])
