@@ -276,11 +276,54 @@ def test_pixels_that_differ_at_one_wavelength_alone(tmp_path):
     (dim,) = [c for c in known.checks if c.statistic == "pixel_map" and c.capture == "dim"]
     captures = [c for c in data.captures if c.id != "dark"]
     red = replace(captures[0], light=replace(captures[0].light, wavelength=700e-9))
-    (check,) = ratios_between_wavelengths([red, captures[1]], [map_, dim], 8)
+    rng = np.random.default_rng(5)
+    own = {(c.id, "pixel_map"): rng.standard_normal((96, 64)) for c in captures}
+    (check,) = ratios_between_wavelengths([red, captures[1]], [map_, dim], own)
     assert check.p_value > 1e-3
     shifted = replace(dim.judgement, residuals=dim.judgement.residuals + np.where(np.arange(64) == 17, 8.0, 0.0))
-    (check,) = ratios_between_wavelengths([red, captures[1]], [map_, replace(dim, judgement=shifted)], 8)
+    other = replace(dim, judgement=shifted)
+    (check,) = ratios_between_wavelengths([red, captures[1]], [map_, other], own)
     assert check.p_value < 1e-6 and "row 2, column 1" in check.where
+    # a pixel of which hardly anything is expected is left out, and the others are compared all the same
+    expected = np.where(np.arange(64) == 40, 0.0, map_.judgement.expected)
+    dead = replace(map_, judgement=replace(map_.judgement, expected=expected))
+    (check,) = ratios_between_wavelengths([red, captures[1]], [dead, other], own)
+    assert check.p_value < 1e-6 and "row 2, column 1" in check.where
+    # where the pixels of a right model scatter unequally, the largest is judged by theirs
+    wide = np.where(np.arange(64) < 4, 4.0, 1.0)
+    ps = []
+    for _ in range(40):
+        drawn = [
+            replace(c, judgement=replace(c.judgement, residuals=wide * rng.standard_normal(64))) for c in (map_, dim)
+        ]
+        unequal = {key: wide * rng.standard_normal((96, 64)) for key in own}
+        ps += [one.p_value for one in ratios_between_wavelengths([red, captures[1]], drawn, unequal)]
+    # a sum of four squares has more of a tail than the gamma law: more than 5 of 40 would be a wrong law
+    assert np.sum(np.array(ps) < 1e-3) <= 5, np.sort(ps)[:6]
+
+
+def test_a_spread_of_the_pixels_alike_at_both_wavelengths_leaves_their_ratio() -> None:
+    """Of frames that are full at one of them: what is in proportion are the rates, not the detections."""
+    layout = sp.Layout(16, 16, 25e-12, 1.0)
+    pdp = sp.effects.ByWavelength((500e-9, 700e-9), (0.4, 0.2))
+    model = sp.Sensor(layout, [sp.effects.Detection(pdp=pdp)], rules="device")
+    spread = 1 + 0.05 * np.random.default_rng(2).standard_normal(256)
+    truth = model.with_values({"detection.relative": spread})
+    photon = 6.62607015e-34 * 299792458.0
+    plan = [
+        sp.Capture(
+            name,
+            "qis",
+            wavelength=wave,
+            frames=6000,
+            frame_time=10e-6,
+            irradiance=events / 10e-6 / q * photon / wave / layout.pixel_area,
+        )
+        for name, wave, q, events in (("green", 500e-9, 0.4, 2.3), ("red", 700e-9, 0.2, 0.36))
+    ]
+    found = compare(model, sp.simulate(truth, plan, seed=1), jobs=1, replicates=48)
+    checks = {c.statistic: c.p_value for c in found.checks if c.capture in (None, "green")}
+    assert checks["pixel_map"] < 1e-6 and checks["wavelength_ratio"] > 1e-4, checks
 
 
 def test_the_next_sensor_does_not_take_the_place_of_the_first(tmp_path):

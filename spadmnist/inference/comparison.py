@@ -12,7 +12,7 @@ import itertools
 import json
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,13 +33,14 @@ from .deviations import LISTED, Deviation, deviations, excess, listed
 from .evaluation import Evaluation, mean_misfit, misfit_null_95, misfits
 from .levels import FALSE_ALARM, HALF_95, LEAST_P, SHARE_OF_STATISTICS, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
-from .null_distribution import Judgement
+from .null_distribution import Judgement, p_of_largest, p_of_scatter
 from .phases import evaluate_start
 from .replicates import REPLICATES, TOTALS, Cell, Execution, Replicates
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
-# expected detections from which on, in every pixel, its ratio between two wavelengths is compared; a rule of thumb
-_ENOUGH = 20.0
+_ENOUGH = 20.0  # expected detections of a pixel, from which on its ratio is compared; a rule of thumb
+# expectations between which slopes are interpolated; relative: how far to both sides a slope is taken
+_POINTS, _ASIDE = 64, 1e-3
 
 
 @dataclass(frozen=True)
@@ -283,7 +284,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
     captures = [seen.capture for seen in replicates.seen.values()]
     nuisances, common = light_of(levels, captures)
     checks += common
-    checks += ratios_between_wavelengths(captures, checks, replicates.start.layout.columns)
+    checks += ratios_between_wavelengths(captures, checks, evaluation.replicate_residuals)
     if not checks:
         raise InputError(nothing_to_compare(replicates))
     checks = holm_corrected([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
@@ -325,10 +326,16 @@ def nothing_to_compare(replicates: Replicates) -> str:
     )
 
 
-def ratios_between_wavelengths(captures: Sequence[Capture], checks: Sequence[Check], columns: int) -> list[Check]:
-    """The checks of the pixels' ratios between neighbouring wavelengths.
+def ratios_between_wavelengths(
+    captures: Sequence[Capture], checks: Sequence[Check], own: Mapping[Cell, np.ndarray]
+) -> list[Check]:
+    """The checks of the pixels' ratios between neighbouring wavelengths, of the pixels with enough detections at both.
 
-    Each wavelength has its capture with the most detections.
+    Each wavelength has its capture with the most detections. Deviations are those of the rates, of which a factor that
+    is the same at both wavelengths drops out.
+
+    Args:
+        own: the residuals of the replicates, (replicates, cells), whose scatter pixels have together.
     """
     best: dict[float, tuple[float, Check]] = {}
     for capture in captures:
@@ -340,36 +347,53 @@ def ratios_between_wavelengths(captures: Sequence[Capture], checks: Sequence[Che
         if wave not in best or total > best[wave][0]:
             best[wave] = total, found
     out = []
-    waves = sorted(best)
-    for short, long in itertools.pairwise(waves):
-        one, other = best[short][1].judgement, best[long][1].judgement
-        if one is None or other is None or one.expected.size != other.expected.size or one.expected.min() < _ENOUGH:
+    for short, long in itertools.pairwise(sorted(best)):
+        pair = [best[wave][1] for wave in (short, long)]
+        judged = [check.judgement for check in pair if check.judgement is not None]
+        if len({j.expected.size for j in judged}) > 1:
             continue
-        if other.expected.min() < _ENOUGH:
+        some = np.flatnonzero(np.min([j.expected for j in judged], axis=0) >= _ENOUGH)
+        if len(some) < 2:
             continue
-        widths = [j.spread / j.expected for j in (one, other)]
-        difference = other.residuals * widths[1] - one.residuals * widths[0]
-        z = difference / np.hypot(*widths)
-        worst = int(np.argmax(np.abs(z)))
-        square = float(np.mean(z**2))
-        p_sum = float(stats.chi2.sf(square * z.size, z.size))
-        p_cell = min(1.0, 2 * z.size * float(stats.norm.sf(abs(float(z[worst])))))
-        place = f"row {worst // columns}, column {worst % columns}"
+        widths = [_relative_widths(check, some) for check in pair]
+        each = [j.residuals[some] for j in judged]
+        replicates = [own[str(check.capture), _MAP][:, some] for check in pair]
+        number = min(map(len, replicates))
+        differences = [b * widths[1] - a * widths[0] for a, b in (each, [z[:number] for z in replicates])]
+        wide = np.hypot(*widths)
+        z, z_own = (difference / wide for difference in differences)
+        worst, square, squares = int(np.argmax(np.abs(z))), float(np.mean(z**2)), np.mean(z_own**2, axis=1)
+        mean = float(squares.mean())
+        p_sum, p_cell = p_of_scatter(square, squares, z.size), p_of_largest(z, z_own)
         names = " over ".join(units.show(wave, "m") for wave in (long, short))
-        size = f"{100 * float(difference[worst]):+.2f} % in the worst pixel"
-        p = min(1.0, 2 * min(p_sum, p_cell))
+        size = float(differences[0][worst])
+        summary = pair[0].summary
+        assert summary is not None
         out.append(
             Check(
                 statistic="wavelength_ratio",
                 capture=None,
-                misfit=square,
-                p_value=p,
-                where=f"{place}, {names}",
-                size=size,
-                relative=float(difference[worst]),
+                misfit=square / mean,
+                p_value=min(1.0, 2 * min(p_sum, p_cell)),
+                where=f"{summary.where(int(some[worst]))}, {names}",
+                size=f"{100 * size:+.2f} % in the worst pixel",
+                relative=size,
             )
         )
     return out
+
+
+def _relative_widths(check: Check, some: np.ndarray) -> np.ndarray:
+    """The scatter of the rates of some pixels of a map of the array, relative, (pixels,)."""
+    judged, summary = check.judgement, check.summary
+    assert judged is not None and summary is not None
+    expected, spread = judged.expected[some], judged.spread[some]
+    if summary.rate is None:
+        return np.asarray(spread / expected)
+    points = np.unique(np.quantile(expected, np.linspace(0, 1, _POINTS)))
+    rates = np.array([[summary.rate(value * (1 + h)) for h in (-_ASIDE, _ASIDE)] for value in points.tolist()])
+    slopes = np.log(rates[:, 1] / rates[:, 0]) / (2 * _ASIDE)  # d log rate / d log value
+    return np.asarray(spread / expected * np.interp(expected, points, slopes))
 
 
 def _level_checks(

@@ -156,7 +156,8 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
     best: tuple[float, str] | None = None
     model = next(iter(replicates.seen.values())).capture
     sensor = evaluation.sensors.one
-    conditions = replace(_dark(model.conditions), exposure=_LONG)
+    clock = replace(model.conditions, exposure=_LONG, frames=1, frame_time=_LONG, frame_period=_LONG, bits=0)
+    conditions = _dark(clock)
     tries = [("dark, 100 s", Capture("dark", "tr", Light(), conditions), 0.0)]
     for id, seen in replicates.seen.items():
         light = seen.capture.light

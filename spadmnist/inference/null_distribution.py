@@ -28,6 +28,8 @@ _BEYOND = 1.0
 # factor on scores that are normal by themselves, least: replicates without a detection all have the same score, and one
 # detection would then be any number of sigma. A rule of thumb
 _LEAST_OF_SCORES = 0.5
+# safety factor on the variance of independent squares; the ratio to it from which on values are dependent
+_SURER, _JOINED = 1.1, 1.6
 _LEAST = 1e-300  # in place of a variance of 0: near the least number of a double
 
 
@@ -254,6 +256,31 @@ def p_of_squares(square: float, mean: float, variance: float) -> float:
     """The one-sided p-value of a sum of squares, by the gamma law with this mean and variance."""
     shape = mean**2 / max(variance, 1e-12 * mean**2 + _LEAST)
     return float(stats.gamma.sf(square, shape, scale=mean / shape)) if square > mean else 1.0
+
+
+def p_of_scatter(square: float, squares: np.ndarray, number: int) -> float:
+    """The p-value of so many values whose mean square is larger than those of the replicates.
+
+    Args:
+        square: of the data; squares: (replicates,).
+    """
+    mean, variance = float(squares.mean()), float(squares.var(ddof=1))
+    apart = 2 * mean**2 / number  # variance of the mean square of independent values
+    # a few replicates give a poor variance: where they do not contradict it, that of independent values holds
+    variance = _SURER * apart if variance < _JOINED * apart else variance * (1 + math.sqrt(5 / len(squares)))
+    shape = mean**2 / max(variance, 1e-12)
+    return float(stats.gamma.sf(square, shape, scale=mean / shape))
+
+
+def p_of_largest(z: np.ndarray, own: np.ndarray) -> float:
+    """The p-value of the largest of some values, whose scatter, and its tail, are those of the replicates.
+
+    Args:
+        z: (values,); own: (replicates, values).
+    """
+    wide = max(1.0, float(np.sqrt(np.mean(own**2))))
+    wide *= tail_of(own / wide)
+    return min(1.0, 2 * z.size * float(stats.norm.sf(float(np.max(np.abs(z))) / wide)))
 
 
 def tail_of(z: np.ndarray) -> float:

@@ -21,6 +21,7 @@ from .capture_replicates import CannotSimulate
 from .coordinates import Key
 from .evaluation import Evaluation, stacked
 from .levels import LEAST_P
+from .null_distribution import p_of_largest, p_of_scatter
 from .replicates import FEW, TOTALS, Cell, Replicates
 from .signature import Sampling, Signature, signatures, template_of
 from .spectral_lines import Line
@@ -43,8 +44,6 @@ _LEAST_VARIANCE = 0.3  # the least variance of a cell in the shrunk covariance; 
 # the scatter beyond which the cells of a signature are dependent, and its score has the tails of few; the least degrees
 # of freedom then
 _TOGETHER, _FEWEST = 1.25, 3.0
-# safety factor on the variance of independent squares; the ratio to it from which on values are dependent
-_SURER, _JOINED = 1.1, 1.6
 _Weigh = Callable[[np.ndarray], np.ndarray]  # template (cells,) -> weights (cells,)
 
 
@@ -469,16 +468,8 @@ def p_of_spread(data: np.ndarray, null: np.ndarray) -> float:
         data: (values,).
         null: (replicates, values).
     """
-    square, squares = float(np.mean(data**2)), np.mean(null**2, axis=1)
-    mean, variance = float(squares.mean()), float(squares.var(ddof=1))
-    apart = 2 * mean**2 / data.size  # variance of the mean square of independent values
-    # a few replicates give a poor variance: where they do not contradict it, that of independent values holds
-    variance = _SURER * apart if variance < _JOINED * apart else variance * (1 + math.sqrt(5 / len(squares)))
-    shape = mean**2 / max(variance, 1e-12)
-    p_sum = float(stats.gamma.sf(square, shape, scale=mean / shape))
-    wide = max(1.0, float(np.sqrt(mean)))
-    p_cell = min(1.0, 2 * data.size * float(stats.norm.sf(float(np.max(np.abs(data))) / wide)))
-    return min(1.0, 2 * min(p_sum, p_cell))
+    p_sum = p_of_scatter(float(np.mean(data**2)), np.mean(null**2, axis=1), data.size)
+    return min(1.0, 2 * min(p_sum, p_of_largest(data, null)))
 
 
 def sigmas_of(p: float) -> float:

@@ -44,7 +44,8 @@ class Summary:
     columns) where the cells are a map of the array. nested: (cells,) of normal scores of which each is of what the one
     before is of and of more, as counts in windows twice as long: their correlation with that one. contrasts: (patterns,
     cells), orthonormal: a deviation of this pattern is tested by itself, for one that is spread over all cells is lost
-    in the sum of their squares. contrast_words: the name of each, "a rise or a fall".
+    in the sum of their squares. contrast_words: the name of each, "a rise or a fall". rate: a value -> the rate that it
+    stands for, in any unit, where values of several captures are set in proportion.
     """
 
     values: np.ndarray
@@ -59,6 +60,7 @@ class Summary:
     nested: np.ndarray | None = None
     contrasts: np.ndarray | None = None
     contrast_words: Sequence[str] = ()
+    rate: Callable[[float], float] | None = None
 
     def place(self, cell: int, contrast: int | None = None) -> str:
         """What a cell looks at, in words; as the place where a contrast is clearest, if its index is given."""

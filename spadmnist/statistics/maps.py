@@ -163,6 +163,7 @@ class PixelMap(Statistic):
             axis=np.arange(layout.pixels, dtype=np.float64),
             label="pixel",
             shape=layout.shape if layout.positions is None else None,
+            rate=lambda value: float(law.rates(np.array(law.detections(value)))),
         )
 
 
@@ -283,7 +284,9 @@ class Surface(Statistic):
         law = _Counting(recording)
         rates = law.rates(law.counts)
         mean = rates.mean()
-        fitted = basis.fit(rates / mean if mean > 0 else np.ones_like(rates))
+        if not mean > 0:  # all such have the same coefficients, which one detection would leave by any sigma
+            return None
+        fitted = basis.fit(rates / mean)
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             text = f"{per_cent(measured)} of the mean rate, {per_cent(expected)} expected"
