@@ -307,7 +307,7 @@ def test_a_spread_of_the_pixels_alike_at_both_wavelengths_leaves_their_ratio() -
     layout = sp.Layout(16, 16, 25e-12, 1.0)
     pdp = sp.effects.ByWavelength((500e-9, 700e-9), (0.4, 0.2))
     model = sp.Sensor(layout, [sp.effects.Detection(pdp=pdp)], rules="device")
-    spread = 1 + 0.05 * np.random.default_rng(2).standard_normal(256)
+    spread = 1 + 0.05 * np.random.default_rng(4).standard_normal(256)
     truth = model.with_values({"detection.relative": spread})
     photon = 6.62607015e-34 * 299792458.0
     plan = [
@@ -323,7 +323,7 @@ def test_a_spread_of_the_pixels_alike_at_both_wavelengths_leaves_their_ratio() -
     ]
     found = compare(model, sp.simulate(truth, plan, seed=1), jobs=1, replicates=48)
     checks = {c.statistic: c.p_value for c in found.checks if c.capture in (None, "green")}
-    assert checks["pixel_map"] < 1e-6 and checks["wavelength_ratio"] > 1e-4, checks
+    assert checks["pixel_map"] < 1e-6 and checks["wavelength_ratio"] > 1e-3, checks
 
 
 def test_the_next_sensor_does_not_take_the_place_of_the_first(tmp_path):
