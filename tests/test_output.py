@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import zarr
@@ -15,7 +18,7 @@ from zarr.storage import ZipStore
 
 import spadmnist
 from spadmnist import config, factory, manifest_file, verify
-from spadmnist.errors import ConfigError, InputError
+from spadmnist.errors import ConfigError, InputError, SpadError
 
 ON_READING = "reconstructions: on_reading"
 SMALL = "compression: small"
@@ -126,3 +129,44 @@ def test_none_is_added_where_they_are_made_on_reading(tmp_path: Path) -> None:
 def test_hdf5_has_one_compression(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="compression: small is for format: zarr"):
         config.read(file_of(tmp_path, [SMALL], "hdf5"))
+
+
+METHOD = '''
+from spadmnist.reconstruct import Method
+
+
+class Halved(Method):
+    """Half of the counts."""
+
+    columns = ("counts",)
+
+    def estimate(self, settings, counts):
+        return counts / 2.0
+'''
+
+
+def test_a_method_of_ones_own_that_is_made_on_reading_is_exported(tmp_path: Path) -> None:
+    """By a program that has not loaded it before."""
+    (tmp_path / "halved.py").write_text(METHOD)
+    (tmp_path / "set").mkdir()
+    file = file_of(tmp_path / "set", [ON_READING])
+    file.write_text(file.read_text().replace("reconstruct: [", "reconstruct: [halved, "))
+    own = ["--plugin", str(tmp_path / "halved.py")]
+    out, rows = str(tmp_path / "out"), str(tmp_path / "rows")
+    for words in (
+        ["generate", str(file), "-o", out, "-j", "1", *own],
+        ["export", out, "-o", rows, "--format", "npz", "--limit", "1", "--method", "halved", *own],
+    ):
+        done = subprocess.run([sys.executable, "-m", "spadmnist", *words], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "rows").rglob("*.npz"))
+
+
+def test_a_file_that_is_open_already_is_not_called_damaged(tmp_path: Path) -> None:
+    place = made(tmp_path / "open", format="hdf5")
+    with (
+        h5py.File(place / "data" / "5_mlux" / "train" / "00000.h5", "r"),
+        pytest.raises(SpadError, match=r"open already, and locked; .*locking=F"),
+    ):
+        for level in spadmnist.open(place).levels:
+            spadmnist.open(place)[level, "train"].tr[0]

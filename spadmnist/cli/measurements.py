@@ -229,6 +229,7 @@ def import_(
     type=click.Choice(["tr", "str", "qis", "counts"]),
     help="Dataset: only this readout. Repeatable for images.",
 )
+@options.plugin
 @options.as_json
 def export(
     dataset: Path,
@@ -240,6 +241,7 @@ def export(
     limit: int | None,
     methods: tuple[str, ...],
     readouts: tuple[str, ...],
+    plugin_files: tuple[Path, ...],
     as_json: bool,
 ) -> None:
     """Write the captures of MEASUREMENT (or of a dataset of uniform images), or the images of DATASET, to OUT.
@@ -257,6 +259,7 @@ def export(
 
     if output is None or format_ is None:
         raise SpadError("--output: name a file or folder and its format, for example -o lab.npz --format npz")
+    options.load_plugins(plugin_files)
     choice = image_exporters.Choice(levels, splits, limit, methods, readouts)
     image_exporters.check_source(dataset)
     if image_exporters.is_of_images(dataset, format_, choice):

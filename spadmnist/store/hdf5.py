@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numcodecs.fletcher32 import Fletcher32
 
+from ..errors import SpadError
 from ..sources import Reading
 from .chunks import Damaged
 from .columns import TYPES, Column, group_of, rows_of
@@ -119,6 +120,11 @@ class _Reader(ShardReader):
         except Damaged as error:
             raise self._refuse(self._place, str(error)) from None
         except (OSError, RuntimeError, KeyError, OverflowError, ValueError, TypeError, MemoryError) as error:
+            if "locking flag" in str(error):
+                raise SpadError(
+                    f"{self.root}: this program has {self._place} open already, and locked; close it there, or open it "
+                    "by h5py.File(FILE, 'r', locking=False)"
+                ) from None
             raise self._refuse(self._place, f"HDF5 cannot read it ({error})") from None
         finally:
             handle.close()
