@@ -418,6 +418,8 @@ class Dataset:
         return lazy.to_xarray(part, found.kind, found.value)
 
     def __getitem__(self, key: str | tuple[str, str]) -> Part:
+        if isinstance(key, tuple) and len(key) != 2:
+            raise UnknownName(f"{key!r} is not a part; give a level and a split, ds['5 mlux', 'train']")
         level_text, split = key if isinstance(key, tuple) else (key, None)
         level = level_of(self._levels, level_text)
         if split is None:

@@ -14,13 +14,14 @@ def photon_energy(wavelength: float) -> float:
     return PLANCK * SPEED_OF_LIGHT / wavelength
 
 
-def of_lux(wavelength: float) -> str | None:
-    """What is to be known of a level in lux at a wavelength (m); None at 555 nm, where it holds."""
-    if abs(wavelength - GREEN) < _NEAR:
+def of_lux(*wavelengths: float) -> str | None:
+    """What is to be known of a level in lux at some wavelengths (m); None where all are 555 nm, where it holds."""
+    far = [f"{one * 1e9:.4g} nm" for one in wavelengths if abs(one - GREEN) >= _NEAR]
+    if not far:
         return None
     return (
         "lux is turned into power with 683 lm/W, which holds at 555 nm, not at "
-        f"{wavelength * 1e9:.4g} nm; give irradiance where the light is not green"
+        f"{' or '.join(far)}; give irradiance where the light is not green"
     )
 
 

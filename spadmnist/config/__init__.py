@@ -211,5 +211,5 @@ def of_sensor(
 
 
 def _notes(scene: _Scene, source: Document) -> tuple[str, ...]:
-    found = [note for one in scene.wavelengths if (note := light.of_lux(float(one)))] if scene.lux else []
-    return tuple(f"{source.place(('scene', 'wavelength'))}: {note}" for note in found[:1])
+    note = light.of_lux(*map(float, scene.wavelengths)) if scene.lux else None
+    return () if note is None else (f"{source.place(('scene', 'wavelength'))}: {note}",)
