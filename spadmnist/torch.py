@@ -529,9 +529,9 @@ class Simulated(Dataset[Any]):
         transform: Callable[[EventBatch], Any] | None = None,
     ):
         self.images, self.split, self.returns, self.scale, self.transform = images, split, returns, scale, transform
-        levels = list(lux) if isinstance(lux, tuple | list) else [lux]
-        if len(levels) not in (1, 2) or not all(isinstance(one, str | int | float) for one in levels):
-            raise SpadError(f"lux: is {lux!r:.80}; give one level, 0.005 or '5 mlux', or (low, high)")
+        levels = list(lux) if isinstance(lux, tuple | list | np.ndarray) else [lux]
+        if len(levels) not in (1, 2) or not all(isinstance(one, str | int | float | np.number) for one in levels):
+            raise SpadError(f"lux: is {lux!r:.80}; give one level, or (low, high), as 0.005 or '5 mlux'")
         methods = [returns] if returns in reconstruct.Method.registry else []
         if not methods and returns not in READOUTS:
             known = ", ".join([*READOUTS, *reconstruct.Method.registry])
