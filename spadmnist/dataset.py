@@ -592,7 +592,8 @@ class _Simulated:
         return medians_of_nonzero(chunks)
 
     def normalisation(self, method: str) -> float | None:
-        return self._normalisations[method] if reconstruct.find(method).normalised else None
+        one = reconstruct.find(method)
+        return reconstruct.divisor(one, self._normalisations[method]) if one.normalised else None
 
     def divisors(self, method: str, start: int, stop: int) -> np.ndarray | None:
         return _alike(self.normalisation(method), start, stop)

@@ -1048,6 +1048,8 @@ def finish(
     if keys:
         (workers if workers.shared else Serial()).run(_normalise, tasks, keys, done)
     progress.stop()
+    for text, method in keys:
+        reconstruct.divisor(reconstruct.find(method), normalisation[text].get(method))
 
     temporary = disk.temporary(root)
     files: Files = {}

@@ -1,23 +1,28 @@
 """The six flux reconstructions: from what a pixel recorded to one number.
 
 Each method is one class; `spadmnist methods` lists them. A method sees only per-pixel sums of the raw stream
-(`spadmnist.readout.Recorded`), so that it never needs the events themselves.
+(`spadmnist.readout.Recorded`), so that it never needs the events themselves. A user's method gets arrays that cannot
+be written, and what it returns is checked: an error names the method and its file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from . import estimators, kernels
-from .plugins import Plugin, Registry
+from .errors import EffectError, SpadError, did_you_mean
+from .events import read_only
+from .plugins import Plugin, Registry, blame, is_built_in, source_file
 from .readout import Recorded
 
 _ROWS_AT_ONCE = 1 << 15  # numbers whose arithmetic stays in the processor's cache
 _VALUES_KEPT = 1 << 25  # of 4 bytes: up to so many the median is found without reading them twice
+_SIGN = 1 << 15  # of the upper 16 bits of a negative float
+_ASCENDING = np.concatenate([np.arange((1 << 16) - 1, _SIGN - 1, -1), np.arange(_SIGN)])  # those bits, by value
 
 # what a method may ask for (columns of Recorded) -> the readout that it comes from
 COLUMNS = {"counts": "tr", "span": "tr", "ones": "qis", "waited": "str"}
@@ -50,13 +55,24 @@ class Method(Plugin, abstract=True):
     unit: ClassVar[str] = "1/s"
     normalised: ClassVar[bool] = True
 
+    def __init_subclass__(cls, abstract: bool = False, **keywords: Any):
+        if not abstract:
+            _check_columns(cls)
+        super().__init_subclass__(abstract=abstract, **keywords)
+
     @classmethod
     def readouts(cls) -> tuple[str, ...]:
         """The readouts that must be recorded."""
         return tuple(sorted({COLUMNS[c] for c in cls.columns}))
 
     def estimate(self, settings: Settings, *columns: Any, **named: Any) -> np.ndarray:
-        """The image from the columns, float64; `+inf` where a saturated pixel has no finite estimate."""
+        """The image from the columns, float64; `+inf` where a saturated pixel has no finite estimate.
+
+        Each value is a function of its own pixel's values alone: it may not depend on other pixels, on how many there
+        are or on their order. Large images are given in parts; of a single column of small integers, what is given is
+        not the pixels but each integer once, 0, 1, 2 and so on, and the image is looked up in what is returned.
+        The columns cannot be written.
+        """
         raise TypeError(f"{self.name} must define estimate")
 
     def saturated(self, settings: Settings, *columns: Any, **named: Any) -> int:
@@ -64,23 +80,35 @@ class Method(Plugin, abstract=True):
         return 0
 
     def stored_when_saturated(self, settings: Settings) -> float:
-        """What a dataset stores where `estimate` is infinite."""
+        """What a dataset stores where `estimate` is infinite: a finite number."""
         return np.inf
 
     def image(self, recorded: Recorded, settings: Settings) -> tuple[np.ndarray, int]:
-        """What a dataset stores: ((rows,) float32, how many of them were saturated)."""
+        """What a dataset stores: ((rows,) float32, how many of them were saturated).
+
+        Raises:
+            EffectError: where the code of a user's method fails, or returns what it must not.
+        """
         columns = [getattr(recorded, name) for name in self.columns]
         values, saturated = np.empty(columns[0].shape, np.float32), 0
         largest = int(columns[0].max(initial=0)) if len(columns) == 1 and columns[0].dtype.kind in "iu" else None
         if largest is not None and largest < _ROWS_AT_ONCE:
             # a function of one small integer is worked out once for each value that occurs
             whole = np.arange(largest + 1)
-            values = estimators.lookup(self._finite(settings, whole).astype(np.float32), columns[0])
+            table = stored(self, settings, whole)
+            values = estimators.lookup(table, columns[0])
+            if not is_built_in(type(self)) and not np.isfinite(table).all():  # of a number that may not occur
+                _check_finite(self, values, columns)
             # where no value is saturated no pixel need be looked at again
-            return values, self.saturated(settings, *columns) if self.saturated(settings, whole) else 0
+            return values, _bounded(self, settings, *columns) if _bounded(self, settings, whole) else 0
         for start in range(0, len(values), _ROWS_AT_ONCE):
             part = [column[start : start + _ROWS_AT_ONCE] for column in columns]
-            values[start : start + _ROWS_AT_ONCE], bounded = self._worked_out(settings, *part)
+            if is_built_in(type(self)):
+                values[start : start + _ROWS_AT_ONCE], bounded = self._worked_out(settings, *part)
+            else:  # by the hooks alone: it may have changed those of a method that works out both at once
+                piece, bounded = stored(self, settings, *part), _bounded(self, settings, *part)
+                _check_finite(self, piece, part)
+                values[start : start + _ROWS_AT_ONCE] = piece
             saturated += bounded
         return values, saturated
 
@@ -89,9 +117,100 @@ class Method(Plugin, abstract=True):
         return self._finite(settings, *columns), self.saturated(settings, *columns)
 
     def _finite(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
-        values = self.estimate(settings, *columns)
+        values = _call(self, "estimate", settings, *columns)
+        _check_estimate(self, values, columns[0].shape)
         infinite = np.isposinf(values)
-        return np.where(infinite, self.stored_when_saturated(settings), values) if infinite.any() else values
+        if not infinite.any():
+            return np.asarray(values)
+        rule = _call(self, "stored_when_saturated", settings)
+        if np.ndim(rule) or np.asarray(rule).dtype.kind not in "fiu":
+            raise _wrong(self, f"stored_when_saturated must return one number, not {rule!r:.80}")
+        return np.where(infinite, rule, values)
+
+
+# --- calls of the hooks: as in `hooks` ----------------------------------------------------------------------------
+
+
+def stored(method: Method, settings: Settings, *columns: np.ndarray) -> np.ndarray:
+    """What `estimate` gives, as a dataset stores it, float32: it is not looked up, and it may not be finite."""
+    values = method._finite(settings, *columns)
+    with np.errstate(over="ignore"):  # then it is infinite, and refused
+        return values.astype(np.float32)
+
+
+def divisor(method: Method, median: float | None) -> float | None:
+    """The median by which images are divided. Raises EffectError where none can be: it is not positive."""
+    if median is not None and not median > 0:
+        raise _wrong(
+            method,
+            f"the median of its non-zero values is {median:g}, by which its images cannot be divided: it must be "
+            "positive; set normalised = False, or return values of which most are positive",
+        )
+    return median
+
+
+def _call(method: Method, hook: str, settings: Settings, *columns: np.ndarray) -> Any:
+    """What a hook returns. Raises EffectError where the code of a user's method fails."""
+    called: Callable[..., Any] = getattr(method, hook)
+    if is_built_in(type(method)):
+        return called(settings, *columns)
+    try:
+        return called(settings, *map(read_only, columns))
+    except SpadError:
+        raise
+    except Exception as error:
+        raise blame(type(method), error) from error
+
+
+def _bounded(method: Method, settings: Settings, *columns: np.ndarray) -> int:
+    """How many pixels are saturated."""
+    found = _call(method, "saturated", settings, *columns)
+    if not isinstance(found, int | np.integer) or not 0 <= found <= columns[0].size:
+        raise _wrong(method, f"saturated must say how many of the {columns[0].size} pixels are, not {found!r:.80}")
+    return int(found)
+
+
+def _check_estimate(method: Method, values: Any, shape: tuple[int, ...]) -> None:
+    """Raises EffectError where `estimate` does not return one float for each pixel."""
+    if isinstance(values, np.ma.MaskedArray):
+        raise _wrong(method, "estimate returns a masked array; give each pixel a number (.filled)")
+    if not isinstance(values, np.ndarray) or values.shape != shape or values.dtype.kind != "f":
+        what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
+        raise _wrong(method, f"estimate must return one float for each pixel, float64 of shape {shape}, not {what}")
+
+
+def _check_finite(method: Method, values: np.ndarray, columns: Sequence[np.ndarray]) -> None:
+    """Raises EffectError where an image of a user's method cannot be stored."""
+    finite = np.isfinite(values)
+    if not finite.all():
+        pixel = int(np.argmin(finite))
+        named = zip(method.columns, columns, strict=True)
+        place = " and ".join(f"{name} is {column[pixel]:g}" for name, column in named)
+        raise _wrong(
+            method,
+            f"its image is not finite: it is {values[pixel]:g} where {place}; return finite values, or +inf where a "
+            "pixel is saturated, and define stored_when_saturated(self, settings): the finite number that is stored "
+            "there",
+        )
+
+
+def _wrong(method: Method, what: str) -> EffectError:
+    """The error that a hook returns what it must not."""
+    return EffectError(f"{source_file(type(method))}: the method {method.name}: {what}")
+
+
+def _check_columns(cls: type[Method]) -> None:
+    """Raises TypeError where a class does not say which columns it needs."""
+    known = f"the columns are {', '.join(COLUMNS)}"
+    example = "write for example columns = ('counts',)"
+    columns = getattr(cls, "columns", None)
+    if columns is None:
+        raise TypeError(f"{cls.__name__}: it has no columns, which say what estimate is given; {known}: {example}")
+    if not isinstance(columns, tuple | list) or not columns:
+        raise TypeError(f"{cls.__name__}: columns is {columns!r:.80}, not a tuple of names; {known}: {example}")
+    for name in columns:
+        if name not in COLUMNS:
+            raise TypeError(f"{cls.__name__}: {name!r} is not a column; {known}.{did_you_mean(str(name), COLUMNS)}")
 
 
 class Counts(Method):
@@ -223,11 +342,11 @@ def median_of_nonzero(chunks: Callable[[], Iterable[np.ndarray]]) -> float | Non
 
 
 def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]]) -> dict[str, float | None]:
-    """Exact medians of the non-zero values (float32, not negative), in memory that does not grow with their number.
+    """Exact medians of the non-zero values (finite float32), in memory that does not grow with their number.
 
     chunks: gives the values anew at each call, in any order, as arrays by name; it is called twice where there are more
-    values than are kept. Non-negative floats are ordered as their bits are, so the upper and then the lower 16 bits of
-    the two middle values are found by counting. None where every value is zero.
+    values than are kept. Non-negative floats are ordered as their bits are, and negative ones the other way round, so
+    the upper and then the lower 16 bits of the two middle values are found by counting. None where every value is zero.
     """
     upper: dict[str, np.ndarray] = {}
     kept: list[dict[str, np.ndarray]] = []
@@ -243,11 +362,14 @@ def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]])
     # for each name the ranks of the two middle values, as (bin of the upper bits, rank within it)
     wanted: dict[str, list[tuple[int, int]]] = {}
     for name, counted in upper.items():
-        running = np.cumsum(counted)
+        ascending = counted[_ASCENDING]
+        running = np.cumsum(ascending)
         total = int(running[-1])
         ranks = [(total - 1) // 2, total // 2] if total else []
-        bins = [int(np.searchsorted(running, rank, side="right")) for rank in ranks]
-        wanted[name] = [(b, rank - int(running[b] - counted[b])) for b, rank in zip(bins, ranks, strict=True)]
+        at = [int(np.searchsorted(running, rank, side="right")) for rank in ranks]
+        wanted[name] = [
+            (int(_ASCENDING[i]), rank - int(running[i] - ascending[i])) for i, rank in zip(at, ranks, strict=True)
+        ]
     lower = {(name, b): np.zeros(1 << 16, np.int64) for name, pairs in wanted.items() for b, _ in pairs}
     for nonzero in kept if room >= 0 else map(_nonzero, chunks()):
         for name, bits in nonzero.items():
@@ -257,7 +379,10 @@ def medians_of_nonzero(chunks: Callable[[], Iterable[Mapping[str, np.ndarray]]])
     for name, pairs in wanted.items():
         middle = []
         for b, rank in pairs:
-            low = int(np.searchsorted(np.cumsum(lower[name, b]), rank, side="right"))
+            negative = b >= _SIGN
+            counted = lower[name, b][::-1] if negative else lower[name, b]
+            low = int(np.searchsorted(np.cumsum(counted), rank, side="right"))
+            low = 0xFFFF - low if negative else low
             middle.append(float(np.array([(b << 16) | low], np.uint32).view(np.float32)[0]))
         medians[name] = sum(middle) / len(middle) if middle else None
     return medians
@@ -268,5 +393,5 @@ def _nonzero(chunk: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _bits_of_nonzero(values: np.ndarray) -> np.ndarray:
-    bits = np.ascontiguousarray(values, np.float32).view(np.uint32).ravel()
-    return bits[bits != 0]
+    flat = np.ascontiguousarray(values, np.float32).ravel()
+    return flat.view(np.uint32)[flat != 0]  # -0 is zero as well

@@ -31,7 +31,7 @@ from .inference.reduction import reduce_with
 from .inference.replicates import simulated
 from .plugins import Distribution, Parameter, source_file
 from .readout import READOUTS, Recorded
-from .reconstruct import Method, Settings
+from .reconstruct import Method, Settings, stored
 from .recording import Capture, Light
 from .sensor import Sensor
 from .signatures import BLOCKS, Shots
@@ -64,6 +64,7 @@ _REPETITIONS = 32
 _RECORDINGS = 24  # of a capture, by which a statistic is checked
 _SCATTER = 8.0  # by such a factor the variance of its cells may differ from their law's: a rule of thumb
 _CHILDREN, _MOST_EVENTS = 4000, 400_000  # by so many a `hazard` is checked, of so many events at most
+_STRIDE = 67  # has no factor in common with the number of pixels of three exposures
 _UNSTATED = 0.01  # relative: a smaller change of the mean need not be stated
 Lights = Mapping[str, tuple[float, int]]
 # what share of white each of its pixels sees, where the effect is one of scenes
@@ -124,7 +125,8 @@ def check_effect(effect: type[Effect] | str, **parameters: Any) -> Report:
 def check_method(method: type[Method] | str) -> None:
     """Does a reconstruction method keep the contract?
 
-    Its image is finite, 0 where nothing was recorded, and that of each exposure whatever others stand beside it.
+    Its code does not fail, and changes nothing that it is given. Its image is finite, 0 where nothing was recorded, and
+    that of each exposure whatever others stand beside it: each value is a function of its own pixel's values alone.
 
     Args:
         method: the class or its name.
@@ -133,6 +135,8 @@ def check_method(method: type[Method] | str) -> None:
         AssertionError: with one sentence, where it does not.
     """
     kind: type[Method] = Method.registry.find(method) if isinstance(method, str) else method
+    if not __debug__:
+        raise AssertionError("Python runs without assertions (-O), which the contract is made of")
     sensor = _sensor(None, "paper", lacking=("dark",))
     conditions = _conditions(1.0, exposure=1e-4, frames=100, bits=1)
     told = (sensor.nominal_pdp(conditions.wavelength), conditions.exposure, sensor.nominal_dead_time, sensor.tick)
@@ -140,12 +144,33 @@ def check_method(method: type[Method] | str) -> None:
     for light in (0.0, 1e5, 1e9):
         what = f"{source_file(kind)}: the method {kind.name}: at {light:g} photons/s"
         recorded = _expose(sensor, np.full((3, sensor.layout.pixels), light), conditions)
-        image, _ = kind().image(recorded, settings)
-        assert image.shape == (3 * sensor.layout.pixels,), f"{what} its image has the shape {image.shape}"
-        assert np.all(np.isfinite(image)), f"{what} its image is not finite"
-        assert light or not image.any(), f"{what} its image is {image[image != 0][0]:g}, not 0"
-        parts = [kind().image(recorded.images(i, i + 1), settings)[0] for i in range(3)]
-        assert np.array_equal(np.concatenate(parts), image), f"{what} an image changes with those beside it"
+        try:
+            _images_of(kind, recorded, settings, light, what)
+        except SpadError as error:
+            raise AssertionError(f"at {light:g} photons/s: {error}") from error
+
+
+def _images_of(kind: type[Method], recorded: Recorded, settings: Settings, light: float, what: str) -> None:
+    """Raises AssertionError where a method's images of three exposures are not as they must be."""
+    image, _ = kind().image(recorded, settings)
+    shape = (3 * recorded.pixels,)
+    assert image.shape == shape, f"{what} its image has the shape {image.shape}"
+    assert np.all(np.isfinite(image)), f"{what} its image is not finite"
+    assert light or not image.any(), f"{what} its image is {image[image != 0][0]:g}, not 0"
+    parts = [kind().image(recorded.images(i, i + 1), settings)[0] for i in range(3)]
+    assert np.array_equal(np.concatenate(parts), image), f"{what} an image changes with those beside it"
+    columns = [getattr(recorded, name) for name in kind.columns]
+    apart = np.arange(*shape) * _STRIDE % shape[0]  # neighbours are none any more
+    for order in (np.arange(*shape), apart):
+        found = stored(kind(), settings, *(column[order] for column in columns))
+        for pixel in np.flatnonzero(~np.isclose(found, image[order], rtol=1e-5, atol=0.0))[:1]:
+            named = zip(kind.columns, columns, strict=True)
+            place = " and ".join(f"{name} is {column[order[pixel]]:g}" for name, column in named)
+            raise AssertionError(
+                f"{what} a pixel in which {place} has {image[order[pixel]]:g} in its image, but {found[pixel]:g} where "
+                "estimate is given the same pixels in other company; each value must be a function of its own pixel's "
+                "values alone"
+            )
 
 
 def check_statistic(statistic: type[Statistic] | str) -> None:

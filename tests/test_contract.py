@@ -433,6 +433,34 @@ def test_a_method_that_does_not_keep_it(answer: float, says: str) -> None:
         check_method(kind)
 
 
+def _in_place(counts: np.ndarray) -> np.ndarray:
+    counts *= 2
+    return counts * 1.0
+
+
+@pytest.mark.parametrize(
+    ("columns", "estimate", "says"),
+    [
+        (("counts",), lambda n: n[:-1] * 1.0, "at 0 photons/s: .*: the method wrong: estimate must return one float"),
+        (("counts",), _in_place, "the method wrong failed: .*not its own to change"),
+        (("counts",), lambda n: n.rot(), "the method wrong failed: AttributeError"),
+        (("counts",), lambda n: np.roll(n, 1) * 1.0, "other company; each value .* of its own pixel's"),
+        (("counts",), lambda n: n - n.mean(), "changes with those beside it"),
+        (("counts",), lambda n: np.sort(n) * 1.0, "other company"),
+        (("counts", "span"), lambda n, span: np.roll(n, 1) * 1.0, "changes with those beside it|other company"),
+        (("counts", "span"), lambda n, span: np.sort(n.reshape(-1, 8)).ravel() * 1.0, "other company"),
+        (("counts", "span"), lambda n, span: n * 1.0, ""),
+    ],
+)
+def test_a_method_is_given_pixels_one_by_one(columns: tuple[str, ...], estimate: Any, says: str) -> None:
+    body = {"estimate": lambda self, settings, *given: estimate(*given), "name": "wrong", "columns": columns}
+    kind = type("Wrong", (Doubtful,), body, abstract=True)
+    if not says:
+        return check_method(kind)
+    with pytest.raises(AssertionError, match=says):
+        check_method(kind)
+
+
 # ---- somebody else's statistic -------------------------------------------------------------------------------
 
 STATISTIC = '''"""Mine."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -277,6 +278,29 @@ def test_a_new_method_from_listing_to_dataset(folder: Path) -> None:
     assert part.reconstruction["root_counts"].normalisation == pytest.approx(
         np.median(np.sqrt(np.concatenate([part.tr[i].counts for i in range(40)]))), rel=1e-6
     )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('("counts",)', '("countz",)', r"mine.py:6: .*RootCounts: 'countz' is not a column.*span.*Did you mean counts"),
+        ('    columns = ("counts",)\n', "", r"mine.py:6: .*RootCounts: it has no columns.*counts, span, ones, waited"),
+        ("np.sqrt(counts)", "counts.sqrt()", r"mine.py:13: the method root_counts failed: AttributeError: .*'sqrt'"),
+        ("np.sqrt(counts)", "np.sqrt(counts)[:-1]", r"mine.py: the method root_counts: estimate must return one float"),
+        ("np.sqrt(counts)", "np.sqrt(counts) + np.inf", r"mine.py: the method root_counts: its image is not finite"),
+        ("np.sqrt(counts)", "-np.sqrt(counts)", r"mine.py: the method root_counts: the median .* is -\d"),
+    ],
+)
+def test_the_mistakes_of_a_method_are_sentences(old: str, new: str, says: str, folder: Path) -> None:
+    """In the command as in Python: with the file, the method and what to do, and not as a fault of the program."""
+    (folder / "mine.py").write_text(METHOD.replace(old, new))
+    (folder / "c.yaml").write_text(CONFIG.replace("[counts]", "[counts, root_counts]"))
+    arguments = ["generate", "c.yaml", "-o", "out", "--jobs", "1", "--plugin", "mine.py"]
+    program = [sys.executable, "-B", "-m", "spadmnist.cli", *arguments]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("SPADMNIST", "PYTEST"))}
+    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+    said = " ".join(done.stderr.split())
+    assert done.returncode == 2 and re.search(says, said) and "fault of the program" not in said, done.stderr
 
 
 def test_the_plug_in_is_asked_for_where_it_is_missing(folder: Path) -> None:

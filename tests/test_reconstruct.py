@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import algorithm1
 import numpy as np
@@ -13,9 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from spadmnist import reconstruct
+from spadmnist.errors import EffectError
 from spadmnist.events import Events
 from spadmnist.readout import Recorded
-from spadmnist.reconstruct import Settings, median_of_nonzero, medians_of_nonzero
+from spadmnist.reconstruct import InterPhoton, Method, Settings, median_of_nonzero, medians_of_nonzero
 
 METHODS = ("counts", "passive_free_running", "inter_photon", "str_flux", "qis_counts", "qis_linear")
 PAPER = Settings(pdp=0.5, exposure=1e-3, dead_time=50e-9, tick=10e-12, frames=100, frame_time=10e-6)
@@ -287,6 +289,138 @@ def test_no_more_is_worked_out_than_there_are_numbers() -> None:
         assert np.array_equal(apart, method.image(recorded(small, ones=small), long)[0]), name
 
 
+# ---- a user's method is guarded ----------------------------------------------------------------------------
+
+
+class Mine(Method, abstract=True):
+    """A method that is no one's."""
+
+    name = "mine"
+    columns = ("counts",)
+
+
+def mine(estimate: Any, **more: Any) -> Method:
+    """A user's method whose `estimate` is a function of the columns."""
+    body = {"estimate": lambda self, settings, *columns: estimate(*columns), **more}
+    return type("Mine", (Mine,), body, abstract=True)()  # type: ignore[call-overload, no-any-return]
+
+
+TWO = ("counts", "span")
+LARGE = [40_000, 5, 7]  # no table is made up to so many
+WRONG: list[tuple[Any, str]] = [
+    (lambda counts: counts[:2] * 1.0, r"float64 of shape \(2,\)"),
+    (lambda counts: np.append(counts, 1.0), r"not float64 of shape \(\d+,\)"),
+    (lambda counts: counts[:, None] * 1.0, r"not float64 of shape \(\d+, 1\)"),
+    (lambda counts: counts.mean(), r"not float64$"),
+    (lambda counts: None, "not NoneType"),
+    (lambda counts: counts.tolist(), "not list"),
+    (lambda counts: counts * 2, r"not int(32|64) of shape"),
+    (lambda counts: counts * 1j, "not complex128 of shape"),
+    (lambda counts: np.ma.masked_less(counts * 1.0, 1), "a masked array"),
+]
+
+
+@pytest.mark.parametrize(("estimate", "says"), WRONG)
+@pytest.mark.parametrize("counts", [[0, 3, 200, 1], LARGE])
+def test_what_estimate_returns_is_checked(estimate: Any, says: str, counts: list[int]) -> None:
+    """Too few values were looked up beyond their end."""
+    with pytest.raises(EffectError, match=f"test_reconstruct.py: the method mine: estimate .*{says}"):
+        mine(estimate).image(recorded(counts), PAPER)
+
+
+def test_the_rules_of_saturated_pixels_are_checked() -> None:
+    for counts in ([0, 3], LARGE):
+        for answer in (0.5, -1, 10**6, None):
+            method = mine(lambda n: n * 1.0, saturated=lambda *_, answer=answer: answer)
+            with pytest.raises(EffectError, match=f"the method mine: saturated must say how many .*, not {answer}"):
+                method.image(recorded(counts), PAPER)
+        method = mine(lambda n: n + np.inf, stored_when_saturated=lambda *_: [1.0, 2.0])
+        with pytest.raises(EffectError, match="the method mine: stored_when_saturated must return one number, not "):
+            method.image(recorded(counts), PAPER)
+
+
+def _doubled(counts: np.ndarray, *others: np.ndarray) -> np.ndarray:
+    counts *= 2
+    return counts.astype(float)
+
+
+def _spoiled(counts: np.ndarray, span: np.ndarray) -> np.ndarray:
+    span[:] = 0
+    return counts.astype(float)
+
+
+def test_what_a_method_is_given_stays() -> None:
+    for counts, columns, estimate in (([0, 3], TWO, _doubled), ([0, 3], TWO, _spoiled), (LARGE, TWO[:1], _doubled)):
+        data = recorded(counts, [1.5] * len(counts))
+        with pytest.raises(EffectError, match=r"the method mine failed: .*it is given is not its own to change"):
+            mine(estimate, columns=columns).image(data, PAPER)
+        assert data.counts is not None and data.span is not None
+        assert data.counts.tolist() == counts and set(data.span) == {1.5}
+        data.counts[0] = 1  # and it can be written by others
+
+
+def test_the_code_of_a_method_fails() -> None:
+    for counts in ([0, 3], LARGE):
+        with pytest.raises(
+            EffectError, match=r"test_reconstruct.py:\d+: the method mine failed: Attrib.*no attribute 'rot'"
+        ):
+            mine(lambda counts: counts.rot()).image(recorded(counts), PAPER)
+        with pytest.raises(EffectError, match="the method mine failed: ZeroDivisionError"):
+            mine(lambda n: n * 1.0, saturated=lambda *_: 1 // 0).image(recorded(counts), PAPER)
+    with pytest.raises(EffectError, match="the method mine failed: TypeError: mine must define estimate"):
+        type("Mine", (Mine,), {}, abstract=True)().image(recorded([1]), PAPER)  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize("answer", [np.inf, -np.inf, np.nan, 1e39])
+def test_an_image_is_finite(answer: float) -> None:
+    for counts, columns in (([0, 3, 7], TWO[:1]), ([0, 3, 7], TWO), (LARGE, TWO[:1])):
+        method = mine(lambda n, *_: np.where(n == 7, answer, 1.0), columns=columns)
+        place = "counts is 7( and span is 0.5)?; .*stored_when_saturated"
+        with pytest.raises(
+            EffectError, match=f"test_reconstruct.py: the method mine: its image is not finite.*{place}"
+        ):
+            method.image(recorded(counts, [0.5] * 3), PAPER)
+        assert mine(lambda n, *_: np.where(n == 4, answer, 1.0), columns=columns).image(  # a number that does not occur
+            recorded(counts, [0.5] * 3), PAPER
+        )[0].tolist() == [1, 1, 1]
+    rule = mine(lambda n: np.where(n == 7, np.inf, 1.0), stored_when_saturated=lambda *_: 2)
+    assert rule.image(recorded([0, 3, 7]), PAPER)[0].tolist() == [1, 1, 2]
+
+
+def test_a_method_that_goes_on_from_another_one() -> None:
+    """Its own `estimate` counts, also where the other one works out image and saturated pixels at once."""
+
+    class Halved(InterPhoton, abstract=True):
+        """Half of it."""
+
+        name = "halved"
+
+        def estimate(self, settings: Settings, counts: np.ndarray, span: np.ndarray) -> np.ndarray:
+            return super().estimate(settings, counts, span) / 2
+
+    data = recorded(counts=[2, 3, 6, 2], span=[0.5, 0.75, 2.75, 0.625])
+    values, saturated = InterPhoton().image(data, HAND)
+    halves, also = Halved().image(data, HAND)
+    assert np.array_equal(halves, values / 2) and saturated == also == 3
+
+
+@pytest.mark.parametrize(
+    ("columns", "says"),
+    [
+        (("countz",), "'countz' is not a column; the columns are counts, span, ones, waited. Did you mean counts"),
+        ("counts", r"columns is 'counts', not a tuple.*\('counts',\)"),
+        ((), "not a tuple of names"),
+        (None, "it has no columns.*the columns are counts, span, ones, waited"),
+        ((1,), "1 is not a column"),
+    ],
+)
+def test_the_columns_are_known(columns: Any, says: str) -> None:
+    known = set(Method.registry.classes)
+    with pytest.raises(TypeError, match=f"Nobodys: .*{says}"):
+        type("Nobodys", (Method,), {} if columns is None else {"columns": columns})
+    assert set(Method.registry.classes) == known
+
+
 # ---- the training median ----------------------------------------------------------------------------------
 
 
@@ -369,3 +503,32 @@ def test_median_of_nothing() -> None:
     assert median_of_nonzero(lambda: [np.zeros(0, np.float32), np.zeros((3, 2), np.float32)]) is None
     assert median_of_nonzero(lambda: [np.array([0, 5, 0], np.float32)]) == 5.0
     assert median_of_nonzero(lambda: [np.array([0, 5], np.float32), np.array([[4]], np.float32)]) == 4.5
+
+
+@settings(max_examples=250, deadline=None, derandomize=True)
+@given(
+    hnp.arrays(np.float32, st.integers(0, 40), elements=st.one_of(floats, st.floats(-(2.0**127), 2.0**127, width=32))),
+    st.lists(st.integers(0, 1000), max_size=4),
+)
+def test_median_of_negative_values(values: np.ndarray, cuts: list[int]) -> None:
+    """Also of both signs; -0 is zero."""
+    for some in (values, -values, np.append(values, np.float32(-0.0))):
+        assert median_of_nonzero(lambda some=some: iter(_cut(some, cuts))) == _expected_median(some)  # type: ignore[misc]
+
+
+def test_median_of_many_negative_values() -> None:
+    rng = np.random.default_rng(2)
+    for values in (
+        rng.normal(1, 5, 70_001).astype(np.float32),
+        np.rint(rng.normal(-2, 3, 70_000)).astype(np.float32),
+        -1 - rng.random(70_000).astype(np.float32) * np.float32(2**-16),  # one upper half, many lower
+    ):
+        assert median_of_nonzero(lambda values=values: [values[:777], values[777:]]) == _expected_median(values)  # type: ignore[misc]
+
+
+def test_a_median_by_which_nothing_can_be_divided() -> None:
+    method = mine(lambda n: n * 1.0)
+    assert reconstruct.divisor(method, None) is None and reconstruct.divisor(method, 2.5) == 2.5
+    for median in (0.0, -2.5):
+        with pytest.raises(EffectError, match=f"the method mine: the median .* is {median:g}, .*normalised = False"):
+            reconstruct.divisor(method, median)

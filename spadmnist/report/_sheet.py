@@ -191,7 +191,7 @@ def _median(part: Part, method: str) -> float | None:
     if _at_hand(part) == len(part):
         return part.reconstruction[method].normalisation
     some = part.reconstruction[method][: _at_hand(part)]
-    return reconstruct.median_of_nonzero(lambda: [some])
+    return reconstruct.divisor(reconstruct.find(method), reconstruct.median_of_nonzero(lambda: [some]))
 
 
 def _basis(part: Part, split: str) -> str | None:
