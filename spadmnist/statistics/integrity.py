@@ -284,8 +284,6 @@ class Gaps(Statistic):
         exposure = recording.conditions.exposure
         end = exposure / unit
         gap, events = longest_gap(found, 0.0, end)
-        if not events:  # of whom all have the same score, which one detection would leave by any number of sigma
-            return None
         log_expected = np.log(events + 1.0) + events * np.log1p(-min(gap / end, 1.0 - 1e-15))
         expected_longer = np.exp(min(log_expected, 700.0))
         if expected_longer > 0.7:
@@ -295,7 +293,9 @@ class Gaps(Statistic):
             score = -special.ndtri_exp(longer)
 
         def length(value: float) -> float:
-            """The gap (s) that has a score."""
+            """The gap (s) that has a score; without an event, the exposure."""
+            if not events:
+                return exposure
             log_of = np.log(np.maximum(-special.log_ndtr(value), 1e-300))
             return float(-np.expm1((log_of - np.log(events + 1.0)) / max(1, events)) * exposure)
 
@@ -303,7 +303,9 @@ class Gaps(Statistic):
             was, wanted = length(measured), length(expected)
             return f"{show(was, 's')}, {show(wanted, 's')} expected", (was - wanted) / exposure
 
-        return Summary(np.array([float(score)]), "normal", lambda cell: "longest silence of the array", size)
+        # a score is normal by itself: recordings without an event all have the same one, and no scatter
+        values, where = np.array([float(score)]), "longest silence of the array"
+        return Summary(values, "normal", lambda cell: where, size, np.ones(1))
 
 
 class FullCounters(Statistic):

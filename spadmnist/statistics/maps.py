@@ -284,9 +284,7 @@ class Surface(Statistic):
         law = _Counting(recording)
         rates = law.rates(law.counts)
         mean = rates.mean()
-        if not mean > 0:  # all such have the same coefficients, which one detection would leave by any sigma
-            return None
-        fitted = basis.fit(rates / mean)
+        fitted = basis.fit(rates / mean if mean > 0 else np.ones_like(rates))
 
         def size(cell: int, measured: float, expected: float) -> tuple[str, float]:
             text = f"{per_cent(measured)} of the mean rate, {per_cent(expected)} expected"
