@@ -119,6 +119,7 @@ class Method(Plugin, abstract=True):
     def _finite(self, settings: Settings, *columns: np.ndarray) -> np.ndarray:
         values = _call(self, "estimate", settings, *columns)
         _check_estimate(self, values, columns[0].shape)
+        values = values if values.dtype.kind == "f" else values.astype(np.float64)
         infinite = np.isposinf(values)
         if not infinite.any():
             return np.asarray(values)
@@ -171,12 +172,12 @@ def _bounded(method: Method, settings: Settings, *columns: np.ndarray) -> int:
 
 
 def _check_estimate(method: Method, values: Any, shape: tuple[int, ...]) -> None:
-    """Raises EffectError where `estimate` does not return one float for each pixel."""
+    """Raises EffectError where `estimate` does not return one number for each pixel."""
     if isinstance(values, np.ma.MaskedArray):
         raise _wrong(method, "estimate returns a masked array; give each pixel a number (.filled)")
-    if not isinstance(values, np.ndarray) or values.shape != shape or values.dtype.kind != "f":
+    if not isinstance(values, np.ndarray) or values.shape != shape or values.dtype.kind not in "fiu":
         what = f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
-        raise _wrong(method, f"estimate must return one float for each pixel, float64 of shape {shape}, not {what}")
+        raise _wrong(method, f"estimate must return one number for each pixel, float64 of shape {shape}, not {what}")
 
 
 def _check_finite(method: Method, values: np.ndarray, columns: Sequence[np.ndarray]) -> None:

@@ -441,7 +441,7 @@ def _in_place(counts: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("columns", "estimate", "says"),
     [
-        (("counts",), lambda n: n[:-1] * 1.0, "at 0 photons/s: .*: the method wrong: estimate must return one float"),
+        (("counts",), lambda n: n[:-1] * 1.0, "at 0 photons/s: .*: the method wrong: estimate must return one number"),
         (("counts",), _in_place, "the method wrong failed: .*not its own to change"),
         (("counts",), lambda n: n.rot(), "the method wrong failed: AttributeError"),
         (("counts",), lambda n: np.roll(n, 1) * 1.0, "other company; each value .* of its own pixel's"),

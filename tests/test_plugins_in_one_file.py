@@ -286,7 +286,11 @@ def test_a_new_method_from_listing_to_dataset(folder: Path) -> None:
         ('("counts",)', '("countz",)', r"mine.py:6: .*RootCounts: 'countz' is not a column.*span.*Did you mean counts"),
         ('    columns = ("counts",)\n', "", r"mine.py:6: .*RootCounts: it has no columns.*counts, span, ones, waited"),
         ("np.sqrt(counts)", "counts.sqrt()", r"mine.py:13: the method root_counts failed: AttributeError: .*'sqrt'"),
-        ("np.sqrt(counts)", "np.sqrt(counts)[:-1]", r"mine.py: the method root_counts: estimate must return one float"),
+        (
+            "np.sqrt(counts)",
+            "np.sqrt(counts)[:-1]",
+            r"mine.py: the method root_counts: estimate must return one number",
+        ),
         ("np.sqrt(counts)", "np.sqrt(counts) + np.inf", r"mine.py: the method root_counts: its image is not finite"),
         ("np.sqrt(counts)", "-np.sqrt(counts)", r"mine.py: the method root_counts: the median .* is -\d"),
     ],

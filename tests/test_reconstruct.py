@@ -314,7 +314,7 @@ WRONG: list[tuple[Any, str]] = [
     (lambda counts: counts.mean(), r"not float64$"),
     (lambda counts: None, "not NoneType"),
     (lambda counts: counts.tolist(), "not list"),
-    (lambda counts: counts * 2, r"not int(32|64) of shape"),
+    (lambda counts: counts > 2, r"not bool of shape"),
     (lambda counts: counts * 1j, "not complex128 of shape"),
     (lambda counts: np.ma.masked_less(counts * 1.0, 1), "a masked array"),
 ]
@@ -326,6 +326,12 @@ def test_what_estimate_returns_is_checked(estimate: Any, says: str, counts: list
     """Too few values were looked up beyond their end."""
     with pytest.raises(EffectError, match=f"test_reconstruct.py: the method mine: estimate .*{says}"):
         mine(estimate).image(recorded(counts), PAPER)
+
+
+def test_whole_numbers_are_numbers() -> None:
+    for counts in ([0, 3, 200, 1], LARGE):
+        image, saturated = mine(lambda n: n * 2).image(recorded(counts), PAPER)
+        assert image.dtype == np.float32 and image.tolist() == [2.0 * n for n in counts] and not saturated
 
 
 def test_the_rules_of_saturated_pixels_are_checked() -> None:
