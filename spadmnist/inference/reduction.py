@@ -84,9 +84,10 @@ class ReducedCapture:
 
     def is_copy(self, other: ReducedCapture) -> bool:
         """Whether both hold the same detections: enough of them, and every statistic has the same values."""
-        if self.counts is None or other.counts is None or self.detections < _FREE or not self.summaries:
+        mine, theirs = (one.capture.modality for one in (self, other))
+        if (mine, self.total, self.last) != (theirs, other.total, other.last):
             return False
-        if self.capture.modality != other.capture.modality or self.last != other.last:
+        if self.counts is None or other.counts is None or self.detections < _FREE or not self.summaries:
             return False
         pairs = [(mine.values, other.summaries[n].values) for n, mine in self.summaries.items() if n in other.summaries]
         return np.array_equal(self.counts, other.counts) and all(
