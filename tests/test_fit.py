@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy import optimize
 
 import spadmnist as sp
 from spadmnist import config
@@ -16,6 +17,7 @@ from spadmnist import measurement as measurements
 from spadmnist.cli import cli
 from spadmnist.effects import Conditions
 from spadmnist.errors import InputError
+from spadmnist.inference.bounded_step import bounded_step
 from spadmnist.inference.candidates import candidates, with_values
 from spadmnist.inference.coordinates import Coordinate, point_of
 from spadmnist.inference.count_model import light_levels_of
@@ -333,6 +335,27 @@ def test_a_number_that_nothing_follows_stays_as_it_is():
     found = gauss_newton_step(None, evaluation, coordinates, values, lambda v: v, JacobianBy(before=before))
     assert found.values["any", "b"] == pytest.approx(0.01)
     assert np.log(found.values["any", "a"] / 0.01) == pytest.approx(-0.5, abs=5 * 0.5 / np.sqrt(30))
+
+
+def test_a_step_within_bounds_is_that_of_a_solver():
+    """Of random least squares, whose curvatures differ by many powers of ten, against scipy's bounded solver."""
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        n = int(rng.integers(1, 7))
+        design = rng.standard_normal((n + 3, n)) @ (np.eye(n) + 0.9 * rng.standard_normal((n, n)))
+        design *= 10 ** rng.uniform(-3, 3, n)
+        wanted = 10 * rng.standard_normal(n + 3)
+        ends = np.stack([-rng.exponential(1, n) * (rng.random(n) < 0.8), rng.exponential(1, n)])
+        free = np.ones(n, bool)
+        found = bounded_step(design.T @ wanted, design.T @ design, np.zeros(n), ends, free)
+        bounds = np.minimum(ends[0], -1e-12), ends[1]
+        known = optimize.lsq_linear(design, wanted, bounds, method="bvls").x
+        squares = [float(((design @ x - wanted) ** 2).sum()) for x in (found, known)]
+        assert np.all((ends[0] <= found) & (found <= ends[1]))
+        assert squares[0] < squares[1] + 1e-4 * (1 + squares[1])
+    assert bounded_step(
+        np.array([0.0, 5.0]), np.diag([1e13, 10.0]), np.zeros(2), np.array([[-9.0] * 2, [9.0] * 2]), np.ones(2, bool)
+    ) == pytest.approx([0.0, 0.5])
 
 
 def test_a_number_at_the_end_of_its_range_leaves_the_others_where_they_fit_best():

@@ -67,6 +67,17 @@ def test_what_a_gate_lets_through_beside_a_dead_time(
     assert gated.expected(light, c, first=True)[0].mean() == pytest.approx(events)
 
 
+@pytest.mark.parametrize("paralyzable", [False, True])
+def test_a_gate_of_many_pixels_is_that_of_few(paralyzable: bool) -> None:
+    """Of many pixels alike but for their light, the means are read off a table."""
+    some = [effects.DeadTime(duration=1e-6, paralyzable=paralyzable), effects.ShortGate(fraction=0.95)]
+    c = Conditions(1e-3, 100, 10e-6, 10e-6, 500e-9)
+    rates = np.geomspace(1e3, 3e7, 64 * 64)
+    many = sp.Sensor(sp.Layout(64, 64, 25e-12, 1.0), [effects.Detection(pdp=1.0), *some], rules="device")
+    found = many.expected(rates[None], c)[1][0, ::64]
+    assert found == pytest.approx(sensor(*some).expected(rates[None, ::64], c)[1][0], rel=3e-4)
+
+
 def counter_of(frames: int, frame_time: float, rate: float) -> sp.Capture:
     light = {"wavelength": 500e-9, "irradiance": rate / (25e-12 / 3.97289171e-19)}  # photons/s on a pixel
     return sp.Capture("one", "counts", **light, frames=frames, frame_time=frame_time, bits=16, counting="counter")
@@ -95,6 +106,16 @@ def test_a_mean_alone_of_a_large_array_takes_seconds(frame_time: float, modality
     started = time.process_time()
     null, _ = of_mean(large, capture, 4e4 * 65536, 64)
     assert time.process_time() - started < 30 and np.all(np.isfinite(null.totals))
+
+
+def test_a_mean_alone_of_many_stamps_is_corrected_by_few() -> None:
+    """Its scatter does not grow with the exposure: a part of that is simulated, however many stamps it has."""
+    blinking = effects.BlinkingDarkCounts(fraction=1.0, amplitude=2e5, rate_on=1e5, rate_off=1e5)
+    bright = sensor(effects.DarkCounts(rate=1e5), blinking, effects.DeadTime(duration=1e-6))
+    for exposure in (0.05, 1.0):
+        capture = sp.Capture("dark", "tr", dark=True, exposure=exposure)
+        null, _ = of_mean(bright, capture, 1e5 * exposure * PIXELS, 64)
+        assert null.dispersion_at(1.0, 0.0) == 1.0 and float(np.std(np.log(null.totals))) < 0.01
 
 
 @pytest.mark.parametrize("period", [10e-3, 20e-3, 3.3e-3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -324,6 +325,28 @@ def test_a_spread_of_the_pixels_alike_at_both_wavelengths_leaves_their_ratio() -
     found = compare(model, sp.simulate(truth, plan, seed=1), jobs=1, replicates=48)
     checks = {c.statistic: c.p_value for c in found.checks if c.capture in (None, "green")}
     assert checks["pixel_map"] < 1e-6 and checks["wavelength_ratio"] > 1e-3, checks
+
+
+def test_a_full_pixel_leaves_the_ratios_of_the_others() -> None:
+    """Of it no rate is told; one other pixel differs at one wavelength alone."""
+    layout = sp.Layout(8, 8, 25e-12, 1.0)
+    rate = np.where(np.arange(64) == 3, 5e6, 10.0)
+    pdp = sp.effects.ByWavelength((500e-9, 700e-9), (0.4, 0.2))
+    model = sp.Sensor(layout, [sp.effects.Detection(pdp=pdp), sp.effects.DarkCounts(rate=rate)], rules="device")
+    photon = 6.62607015e-34 * 299792458.0
+    clock = {"frames": 600_000, "frame_time": 10e-6}
+    plan = [
+        sp.Capture(
+            name, "qis", wavelength=wave, irradiance=0.05 / 10e-6 / q * photon / wave / layout.pixel_area, **clock
+        )
+        for name, wave, q in (("green", 500e-9, 0.4), ("red", 700e-9, 0.2))
+    ]
+    truth = model.with_values({"detection.relative": np.where(np.arange(64) == 17, 1.05, 1.0)})
+    green, red = (sp.simulate(one, [capture], seed=1) for one, capture in zip((truth, model), plan, strict=True))
+    data = sp.Measurement.from_arrays(layout, {plan[0]: green["green"].frames, plan[1]: red["red"].frames})
+    found = compare(model, data, jobs=1, replicates=24)
+    (check,) = [c for c in found.checks if c.statistic == "wavelength_ratio"]
+    assert check.p_value < 1e-6 and "row 2, column 1" in check.where and math.isfinite(check.relative)
 
 
 def test_the_next_sensor_does_not_take_the_place_of_the_first(tmp_path):

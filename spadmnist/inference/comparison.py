@@ -355,6 +355,10 @@ def ratios_between_wavelengths(
         some = np.flatnonzero(np.min([j.expected for j in judged], axis=0) >= _ENOUGH)
         if len(some) < 2:
             continue
+        told = np.min([_relative_widths(check, some) for check in pair], axis=0) > 0  # of a full pixel no rate is told
+        some = some[told]
+        if len(some) < 2:
+            continue
         widths = [_relative_widths(check, some) for check in pair]
         each = [j.residuals[some] for j in judged]
         replicates = [own[str(check.capture), _MAP][:, some] for check in pair]

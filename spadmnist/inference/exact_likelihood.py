@@ -7,8 +7,9 @@ states. Intervals are by profile likelihood: twice the log-likelihood falls by 3
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -285,8 +286,15 @@ def maximise(
         for model in (changed, elsewhere):
             if word := not_in_likelihood(model, one.capture):
                 raise NoLikelihood(word)
-    try:
+    with _few_gaps(data):
         return _maximum(Likelihood(sensor, data, coordinates, fixed), data, candidates, values, start, errors, mapped)
+
+
+@contextlib.contextmanager
+def _few_gaps(data: Sequence[Recording]) -> Iterator[None]:
+    """Raise NoLikelihood where a law would hold more gaps than it may."""
+    try:
+        yield
     except TooManyGaps:
         close = sum(len(r.events) for r in data if r.events is not None)
         raise NoLikelihood(f"{close:.3g} time stamps so close to each other") from None
@@ -370,6 +378,9 @@ def likelihood_ratios(
 
     Args:
         sensor, data, candidates: as in `maximise`, which returned `found`.
+
+    Raises:
+        NoLikelihood: where more time stamps are close to each other than are held at once.
     """
     out = []
     for candidate in candidates:
@@ -380,12 +391,13 @@ def likelihood_ratios(
         u = point_of(others, found.values)
         without.begin(u)
         without.own = found.own
-        lower = without(u)
-        if others:  # they take up what they can of it
-            scales = np.array([max(d.error(*found.intervals[d.key]), _LEAST_SCALE) for d in others])
-            ends = np.array([d.ends for d in others]).T
-            top = maximum(without, u, scales, ends)
-            assert top is not None
-            lower = max(top.value, without.highest[0])
+        with _few_gaps(data):
+            lower = without(u)
+            if others:  # they take up what they can of it
+                scales = np.array([max(d.error(*found.intervals[d.key]), _LEAST_SCALE) for d in others])
+                ends = np.array([d.ends for d in others]).T
+                top = maximum(without, u, scales, ends)
+                assert top is not None
+                lower = max(top.value, without.highest[0])
         out.append(2 * (found.value - lower))
     return out

@@ -99,7 +99,7 @@ def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[fl
     if not capture.counts_events:  # a sum of frames has as many
         short = replace(short, modality="qis", conditions=replace(clock, bits=0))
     numbers = np.arange(_RECORDINGS, dtype=np.uint64)
-    if events * frames / c.frames > _MOST * _SHORT:  # one frame holds so many
+    if events * (share if capture.modality == "tr" else frames / c.frames) > _MOST * _SHORT:  # one frame holds so many
         return apart, _lost(steady, capture, level)
     made = simulated(steady, short, np.full(_RECORDINGS, level), numbers, 0)
     logs = np.log([max(float(recording.totals.sum()), 0.5) for recording in made])

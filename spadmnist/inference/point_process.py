@@ -252,6 +252,9 @@ def _of_any_rate(hazard, offsets, used, counts, awake, rate):
                 third -= both * (1.0 - 2.0 * share)
                 fourth += both * (1.0 - 6.0 * both)
             value += math.log(product)
+            if second >= 0.0:  # too far below the peak, above which the integrand is concave
+                rate[i] = counts[i] / awake[i]
+                continue
             step = -first / second
             rate[i] *= math.exp(min(max(step, -1.0), 1.0))
             if abs(first * step) < 1e-7:

@@ -95,7 +95,7 @@ class _Counting:
         With a slot and a half more than there are, so that a full pixel has a rate, too.
         """
         if np.isfinite(self.slots):
-            return -self.slots * np.log((self.slots - counts + 1.5) / (self.slots + 1.5))
+            return -self.slots * np.log((self.slots - np.minimum(counts, self.slots) + 1.5) / (self.slots + 1.5))
         return np.asarray(counts / (1.0 - np.minimum(counts * self.blind, 0.95)))
 
 
