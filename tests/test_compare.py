@@ -20,6 +20,7 @@ from spadmnist.events import Events, Layout
 from spadmnist.inference.comparison import Comparison, canonical, compare, table
 from spadmnist.inference.evaluation import Evaluation, evaluate, misfits
 from spadmnist.inference.light_levels import CaptureNull, score_of_total
+from spadmnist.inference.next_step import after_comparison
 from spadmnist.inference.null_distribution import learn
 from spadmnist.inference.reduction import ReducedCapture
 from spadmnist.inference.replicate_cache import recall
@@ -204,6 +205,10 @@ def test_what_is_smaller_than_the_tolerance_passes_as_not_material() -> None:
     (same,) = [c for c in tolerant.checks if c.statistic == "rate" and c.capture == "dark"]
     assert same.passes and not same.material and same.p_value == check.p_value
     assert tolerant.verdict == "adequate"
+    text = " ".join(table(tolerant).split())
+    assert "none of" in text and "fails beyond the tolerance of 90 %" in text and "within the tolerance" in text
+    assert "by more than chance, and by less than the tolerance" in text
+    assert "finds what makes these checks differ" in after_comparison(tolerant)
 
 
 @pytest.mark.slow

@@ -775,3 +775,36 @@ def test_nothing_is_asked_for_and_nothing_runs(tmp_path: Path, visits: tuple[int
     page.write_text(text)
     shown = browse(page, tmp_path, "--dump-dom")
     assert "<title>&lt;script&gt;" in shown and "<script" not in shown and not asked
+
+
+def cells_that_say(size: Any) -> Any:
+    values = np.array([14.7, 0.0, 2.0])
+    summary = Summary(values, "normal", str, size)
+    return _figures.Cells("autocorrelation", summary, np.zeros(3), np.ones(3), values, 0)
+
+
+def test_a_picture_shows_the_model_where_it_is() -> None:
+    """Of a check whose words take what was found from the recording itself, whatever value they are asked for."""
+    found = np.array([10.0, 0.0, 1.0])
+    said = _figures._as_said(
+        cells_that_say(lambda k, measured, expected: (f"{found[k]:g} % of detections, {expected:g} % expected", 0.0)),
+        np.arange(3),
+        [np.array([14.7, 0.0, 2.0]), np.zeros(3), np.full(3, -1.96), np.full(3, 1.96)],
+    )
+    assert said is not None
+    assert [list(values) for values in said[0]] == [[10.0, 0.0, 1.0], [0.0] * 3, [-1.96] * 3, [1.96] * 3]
+
+
+def test_numbers_of_two_units_are_on_no_scale() -> None:
+    words = ["980 ns, 1.02 us expected", "1 us, 1.02 us expected", "1 us, 1.02 us expected"]
+    cells = cells_that_say(lambda k, measured, expected: (words[k], 0.0))
+    assert _figures._as_said(cells, np.arange(3), [np.zeros(3)] * 4) is None
+    assert _figures._as_said(cells, np.arange(1, 3), [np.zeros(2)] * 4) is not None
+
+
+@pytest.mark.parametrize(("uncertain", "told"), [(0.0, "the stated level"), (0.5, "the other captures")])
+def test_what_a_capture_is_compared_with_is_said(uncertain: float, told: str) -> None:
+    conditions: Any = None
+    captures = [Capture(id, "tr", Light(500e-9, 1.0, "irradiance", uncertain), conditions) for id in ("a", "b")]
+    _, checks = light_of([(capture, 0.18, 0.002, 1.0) for capture in captures], captures)
+    assert all(told in check.size for check in checks if check.capture), [check.size for check in checks]

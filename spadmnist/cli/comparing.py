@@ -230,7 +230,9 @@ def fit(
     )
     _write_sensor(found, output)
     again = options.again(measurement, plugin_files, crop)
-    what = next_step.after_diagnosis(found.found, quoted(sensor), again, quoted(found.file or output))
+    what = next_step.after_diagnosis(
+        found.found, quoted(sensor), again, None if found.file is None else quoted(found.file)
+    )
     with contextlib.ExitStack() as last:
         last.callback(lambda: terminal.print_lines(f"{found}\n\nNext: {what}"))
         last.callback(lambda: _write_answer(json_file, results.canonical(found.found)))

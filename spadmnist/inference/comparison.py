@@ -477,7 +477,8 @@ def light_of(
     ]
     for (capture, log, _, elasticity), e, power in zip(levels, error, follows, strict=True):
         # the common factor by the other captures and the stated level
-        others = informed - power**2 / e**2 + (1 / common**2 if common > 0 else 1e18)
+        by_level, by_others = 1 / common**2 if common > 0 else 1e18, informed - power**2 / e**2
+        others = by_others + by_level
         mean = power * (projection - power * log / e**2) / others
         z = (log - mean) / math.sqrt(e**2 + power**2 / others)
         if capture.light.own_uncertainty > 0:
@@ -487,7 +488,8 @@ def light_of(
                 Nuisance(capture=capture.id, name=name, value=math.exp(log), low=low, high=high, pull=z, stated=stated)
             )
         change = math.expm1((log - mean) * elasticity)
-        size = f"{100 * change:+.2f} % detections relative to the other captures"
+        told = "the other captures" if by_others > by_level else "the stated level"
+        size = f"{100 * change:+.2f} % detections relative to {told}"
         checks.append(
             Check(
                 statistic="rate",
@@ -532,7 +534,8 @@ def canonical(comparison: Comparison) -> str:
 def headline(comparison: Comparison) -> str:
     """The worst check with its physical size as text; the misfit may be blind to it."""
     c = comparison.worst
-    p = f"p = {c.p_value:.1g}, " + ("passes" if c.passes else "fails")
+    passed = "within the tolerance" if c.significant and c.passes else "passes" if c.passes else "fails"
+    p = f"p = {c.p_value:.1g}, {passed}"
     return f"{found_in(c)} ({c.statistic}, {p})"
 
 
@@ -573,7 +576,13 @@ def table(comparison: Comparison) -> str:
         if len(groups) > LISTED:
             lines.append(f"... and {len(groups) - LISTED} more (--json FILE or -o REPORT holds all)")
     else:
-        lines.append(f"The model is adequate: none of {number} checks fails.")
+        beyond = "" if comparison.tolerance is None else f" beyond the tolerance of {100 * comparison.tolerance:g} %"
+        lines.append(f"The model is adequate: none of {number} checks fails{beyond}.")
+        more = sum(check.significant for check in comparison.checks)
+        if more:
+            lines.append(
+                f"{more} differ{'s' if more == 1 else ''} by more than chance, and by less than the tolerance."
+            )
         closest = sorted(comparison.checks, key=lambda c: c.p_value)[1:3]
         near = ", ".join(f"{c.statistic} of {c.capture or 'all captures'} (p = {c.p_value:.2g})" for c in closest)
         text = f"Worst check: {headline(comparison)}" + (f"; then {near}." if near else ".")

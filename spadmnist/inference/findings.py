@@ -63,14 +63,14 @@ def remainder(
     failed, passing = _shown(block_checks(replicates, evaluation, residuals))
     seen = [_failed(replicates, evaluation, residuals, block) for block in failed]
     groups = deviations([one for one, _ in seen], passing)
-    out = []
+    out, each = [], max(_ENTRIES // max(len(groups), 1), 1)  # of each deviation some, and the first of all
     for number, members in enumerate(groups, 1):
-        for i in members:
+        for i in members[:each]:
             one, size = seen[i]
             significance = max(abs(failed[i].z), float(stats.norm.isf(max(failed[i].p, LEAST_P) / 2)))
             entry = {"statistic": one.statistic, "capture": one.capture, "significance": plain(significance)}
             out.append(entry | {"where": one.where + _words(failed[i]), "size": size, "deviation": number})
-    return out[:_ENTRIES]
+    return out
 
 
 def _failed(

@@ -17,6 +17,8 @@ def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str =
         sensor, measurement: as the command named them, quoted for a shell.
         out: the folder of a diagnosis, another one than that of the sensor.
     """
+    if found.verdict == "adequate" and any(check.significant for check in found.checks):
+        return f"spadmnist diagnose {sensor} {measurement} -o {out} finds what makes these checks differ."
     if found.verdict == "adequate":
         if found.full:
             return (
@@ -49,6 +51,8 @@ def after_diagnosis(
     if not found.finished:
         how = "goes on to the end" if kept else "begins again, keeps what it simulates, and goes to the end"
         return f"spadmnist diagnose {sensor} {measurement} {same} --within none {how}."
+    if found.asked == "fit" and new is None:
+        return "the same command with another place for -o writes the fitted model, for compare to check."
     if found.asked == "fit":
         return f"spadmnist compare {new} {measurement} checks the fitted model; {_ANOTHER}."
     if found.verdict == "adequate":

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import reference, units
+from .. import reference, statistics, units
 from ..inference import next_step, results
 from ..inference.comparison import headline
 from ..inference.deviations import listed
@@ -160,7 +160,7 @@ def _fallen(found: Diagnosis) -> tuple[str, float, float] | None:
     if not found.steps or found.before > found.null_95 or len(rows) < 2:
         return None
     first, last = rows[0], rows[-1]
-    names = _columns(found.ladder)
+    names = {name: words for name, words in _columns(found.ladder).items() if name in statistics.OTHER_ERRORS}
     most = max(names, key=lambda name: first.get(name, 0.0) - last.get(name, 0.0))
     fell = _HALF * first.get(most, 0.0) > last.get(most, 0.0)
     return (names[most], first[most], last.get(most, 0.0)) if fell else None

@@ -347,7 +347,7 @@ def _draw_strip(strip: Axes, cells: Cells, axis: np.ndarray, order: np.ndarray, 
 
 # "2.54 times that of a steady rate, 0.936 expected": what was found, its words, what was expected
 _SAID = re.compile(
-    r"([-+]?\d[\d.]*(?:e[-+]?\d+)?)( %)?([^,;\d]*), ([-+]?\d[\d.]*(?:e[-+]?\d+)?)( %)?(?: [a-z]+)? expected"
+    r"([-+]?\d[\d.]*(?:e[-+]?\d+)?)( %)?([^,;\d]*), ([-+]?\d[\d.]*(?:e[-+]?\d+)?)( %)?( [a-z]+)? expected"
 )
 
 
@@ -358,19 +358,24 @@ def _as_said(cells: Cells, shown: np.ndarray, values: Sequence[np.ndarray]) -> t
     """
     if cells.summary.law != "normal":
         return None
-    out, unit = [], ""
+    out, units = [], set()
     try:
-        for some in values:
+        for number, some in enumerate(values):
+            # what was found is said of the measurement; what a model expects stands behind it
             found = [
-                _SAID.search(cells.summary.size(int(k), float(x), float(m))[0])
-                for k, x, m in zip(shown, some, cells.expected[shown], strict=True)
+                _SAID.search(cells.summary.size(int(k), float(m), float(m if number == 0 else x))[0])
+                for k, x, m in zip(shown, some, cells.measured[shown], strict=True)
             ]
             if not all(found):
                 return None
-            out.append(np.array([float(one[1]) for one in found if one]))
-            unit = next(f"{one[2] or ''}{one[3]}".strip() for one in found if one)
+            out.append(np.array([float(one[1 if number == 0 else 4]) for one in found if one]))
+            units |= {f"{one[2] or ''}{one[3]}".strip() for one in found if one}
+            # of two units the numbers are on no common scale: "980 ns, 1.02 us expected"
+            if len(units) > 1 or any(one[2] != one[5] or (one[6] or one[3]) != one[3] for one in found if one):
+                return None
     except Exception:  # of a user's own statistic: the page is worth more than one scale
         return None
+    (unit,) = units
     return (out, shortened(unit, 60)) if np.isfinite(np.concatenate(out)).all() else None
 
 
