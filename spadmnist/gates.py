@@ -1,4 +1,4 @@
-"""The mean of what a pixel detects through a gate that opens once in each frame, beside its dead time."""
+"""The mean number of detections of a pixel with a dead time and a gate that opens once in each frame."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from .effects import Conditions
 
-# dead times in an opening, beyond which the mean is taken by its limit: it is off by less than 0.3 of a count
+# dead times in an opening: beyond it the mean is the asymptotic one, off by a part of one count; a rule of thumb
 _MANY = 20.0
 _TABLE = 1024  # rates of a table, and pixels from which on it is made: within 2e-4 over four decades
-_POINTS = 256  # moments of an opening over which a mean is taken
+_POINTS = 256  # moments of an opening over which a mean is taken; a rule of thumb
 
 
 def detected(
@@ -17,10 +17,10 @@ def detected(
 ) -> np.ndarray:
     """The detections while the gate is open, 1/s, in the shape of the rates.
 
-    A pixel opens without a dead time where the one before has ended while the gate was closed. The number of
-    detections of an opening is then that of a renewal process, of the dead time that the steady rates tell. Where the
-    dead time outlasts the closed time, it is that of the mean rate over the frame, and no more than the former: within
-    5 % of the simulation.
+    If the dead time is shorter than the closed time, every opening begins with a live pixel. Its detections are then a
+    renewal process, whose dead time follows from the steady rates. If the dead time is longer, their number is that of
+    the mean rate over the frame, and at most that of a live pixel; the tests allow 6 % against the simulation. Where
+    events extend the dead time, both cases are exact.
     Source: Cox, Renewal Theory (1962), ch. 4; for long openings its asymptotic mean.
 
     Args:

@@ -140,7 +140,7 @@ def test_pixels_with_few_events_each_have_no_likelihood_of_their_own_rates(senso
 
 
 def test_what_another_change_can_take_up_is_no_evidence(sensor: Sensor) -> None:
-    """The ratio of an effect that is not there, beside a number that has part of its trace."""
+    """The likelihood ratio of an absent effect, fitted together with a parameter that correlates with it."""
     truth = with_values(sensor, {CHANCE: 0.02, LIFETIME: 400e-9, RATE: 5000.0})
     model = with_values(truth, {CHANCE: 0.01})
     listed = replace(*named(model, "set afterpulsing.probability"), shapes=())

@@ -328,7 +328,7 @@ def test_a_spread_of_the_pixels_alike_at_both_wavelengths_leaves_their_ratio() -
 
 
 def test_a_full_pixel_leaves_the_ratios_of_the_others() -> None:
-    """Of it no rate is told; one other pixel differs at one wavelength alone."""
+    """The full pixel says nothing of its rate. Another pixel differs at one wavelength alone."""
     layout = sp.Layout(8, 8, 25e-12, 1.0)
     rate = np.where(np.arange(64) == 3, 5e6, 10.0)
     pdp = sp.effects.ByWavelength((500e-9, 700e-9), (0.4, 0.2))

@@ -13,8 +13,7 @@ def bounded_step(
 ) -> np.ndarray:
     """The step from a point within bounds to the highest point of a parabola, (n,).
 
-    A coordinate that reaches a bound stays there while the parabola rises beyond it, and the others have their best
-    values beside it.
+    A coordinate stays at its bound while the parabola rises beyond it. The others are maximized with it held.
     Source: Nocedal and Wright, Numerical Optimization (2006), algorithm 16.3 (active sets).
 
     Args:

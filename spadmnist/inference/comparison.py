@@ -355,7 +355,8 @@ def ratios_between_wavelengths(
         some = np.flatnonzero(np.min([j.expected for j in judged], axis=0) >= _ENOUGH)
         if len(some) < 2:
             continue
-        told = np.min([_relative_widths(check, some) for check in pair], axis=0) > 0  # of a full pixel no rate is told
+        # a full pixel says nothing of its rate
+        told = np.min([_relative_widths(check, some) for check in pair], axis=0) > 0
         some = some[told]
         if len(some) < 2:
             continue

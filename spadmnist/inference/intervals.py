@@ -178,7 +178,7 @@ def _naive(fit: Fit) -> np.ndarray:
 
 
 def _along(fit: Fit | None, coordinate: Coordinate, end: float) -> dict[Key, float]:
-    """The values with a coordinate at an end of its range, and the others of the fit where they fit best beside it."""
+    """The values with one coordinate held at an end of its range and the others of the fit maximized again."""
     if fit is None or coordinate not in fit.coordinates:
         return {coordinate.key: end}
     i, naive = fit.coordinates.index(coordinate), _naive(fit)

@@ -29,7 +29,7 @@ _LEAST = 1e-9
 # events that are stamped to measure the blur, at least: by the normal law their standard deviation is known to 1.1 %
 _PROBES = 4096
 # stamps of a pixel, below which it is left out where pixels have rates of their own: what few stamps say of a trap
-# depends on how the rates of the pixels are distributed. With as many, Laplace's method errs by 1e-3 in each pixel
+# depends on how the rates of the pixels are distributed. A rule of thumb: the next term of Laplace's method is 1/MANY^2
 MANY = 30
 _LONG = 20.0  # lifetimes after which a trap is empty: 2e-9 of its content is left
 _PIECE = 1 << 20  # gaps that are looked at together: memory against time, and no result depends on it; a rule of thumb
