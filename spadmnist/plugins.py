@@ -45,10 +45,11 @@ PER = ("", "pixel", "row", "column", "code")  # what a parameter may have a valu
 #   time       by gradients where it is a shape; as a strength in steps, for no signature is proportional to it
 #   edge       a time at which something begins or ends at once: also in steps of a few thousandths
 #   count      from one whole number to the next
+#   multiple   where it is listed, from one whole multiple or whole part of that to the next; else as a time
 #   frequency  of a line, in Hz: it is tried where the data have one
 #   phase      of a line: another one in each capture
 #   switch     yes or no
-KINDS = ("smooth", "time", "edge", "count", "frequency", "phase", "switch")
+KINDS = ("smooth", "time", "edge", "count", "multiple", "frequency", "phase", "switch")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import pytest
 from labs import CROSSTALK, DURATION, LIFETIME, PROBABILITY, bench_of, change_of, given, names, quiet, taken
 from scipy import stats
 
+import spadmnist as sp
 from spadmnist.inference import conclusion
 from spadmnist.inference.alternatives import alternatives
 from spadmnist.inference.candidates import candidates
@@ -22,17 +23,19 @@ from spadmnist.inference.elimination import drop_needless, drop_unexplaining, no
 from spadmnist.inference.error_budget import from_the_others, rms_beyond_noise
 from spadmnist.inference.evaluation import Evaluation, evaluate, square
 from spadmnist.inference.evidence import evidence_of
-from spadmnist.inference.experiment_design import between, expected_significance
+from spadmnist.inference.experiment_design import between, between_totals, expected_significance
 from spadmnist.inference.gauss_newton import Fit
 from spadmnist.inference.map_trials import random_map_trials
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.model_selection import diagnose
-from spadmnist.inference.replicates import TOTALS, Replicates
+from spadmnist.inference.replicates import TOTALS, Execution, Replicates
 from spadmnist.inference.results import Step, canonical
 from spadmnist.inference.score_test import ScoreTest, p_of_best, score_test
+from spadmnist.inference.setups import Factor, SetupExplanation
 from spadmnist.inference.signature import Signature, captures_showing, residuals_at, signatures, template_of
 from spadmnist.inference.trial import Trial, tie
 from spadmnist.inference.upper_limits import share_beside, upper_limits
+from spadmnist.workers import Serial
 
 # --- which capture would tell ------------------------------------------------------------------------------------
 
@@ -471,3 +474,24 @@ def test_two_lit_captures_differ_by_all_of_their_difference() -> None:
 def test_noise_is_no_error_of_a_rate() -> None:
     assert rms_beyond_noise(np.array([0.3, 0.0]), np.array([0.4, 0.0])) == 0.0
     assert rms_beyond_noise(np.array([0.5, 0.5]), np.array([0.3, 0.3])) == pytest.approx(0.4)
+
+
+def test_the_capture_that_is_advised_separates_light_from_a_gate() -> None:
+    """Ten times brighter, all frames are full in either case; in the dark a gate takes a fifth of the counts."""
+    effects = [sp.effects.Detection(pdp=0.4), sp.effects.DarkCounts(rate=20.0)]
+    sensor = sp.Sensor(sp.Layout(4, 4, 25e-12, 1.0), effects, rules="device")
+    clock: dict[str, Any] = {"frames": 1000, "frame_time": 10e-6}
+    light: dict[str, Any] = {"wavelength": 555e-9, "relative_uncertainty": 0.01}
+    flat = [sp.Capture(f"f{k}", "qis", irradiance=x, **light, **clock) for k, x in enumerate((0.001, 0.006))]
+    lab = sp.simulate(sensor, [sp.Capture("dark", "qis", dark=True, **clock), *flat], seed=3)
+    replicates = Replicates(sensor, lab, 0, Execution(Serial()), 8)
+    evaluation = evaluate(replicates, {})
+    key = "short_gate", "fraction"
+    gate = Trial(change_of(replicates, "add short_gate"), {key: 0.8}, Signature({}, {}, {}), 0.0, 1.0)
+    gate.sensors = evaluation.sensors.changed({key: 0.8})
+    log = np.array([math.log(0.8)])
+    weaker = SetupExplanation((Factor("light", ("f0", "f1"), True),), log, np.array([0.01]), np.zeros(2))
+    (told,) = between_totals(quiet(replicates), evaluation, weaker, gate)
+    # 20 Hz in 16 pixels for 100 s: 32,000 counts, of which the gate takes 6,400
+    assert told["capture"] == "dark, 100 s" and told["significance_then"] == pytest.approx(35.8, rel=0.05)
+    assert set(told["separates"]) == {"light", "short_gate"}

@@ -15,8 +15,8 @@ from scipy import stats
 from spadmnist import config, twin
 from spadmnist import measurement as measurements
 from spadmnist.inference.captures_together import Together, checks_together
+from spadmnist.inference.checks import BlockCheck, failing
 from spadmnist.inference.comparison import compare
-from spadmnist.inference.evaluation import BlockCheck, failing
 from spadmnist.inference.null_distribution import Null, learn
 from spadmnist.inference.replicates import no_size
 from spadmnist.measurement import Measurement

@@ -12,7 +12,8 @@ from scipy import stats
 
 import spadmnist as sp
 from spadmnist.inference.captures_together import Together, checks_together
-from spadmnist.inference.evaluation import block_checks, evaluate
+from spadmnist.inference.checks import block_checks
+from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.null_distribution import Null, learn
 from spadmnist.inference.replicates import no_size
 from spadmnist.sensor import Sensor

@@ -190,6 +190,10 @@ def test_a_fall_is_what_the_squares_fall_by(lab):
 # --- what becomes of a closer look -------------------------------------------------------------------------------
 
 
+def with_residuals(evaluation: Evaluation, size: float) -> Evaluation:
+    return replace(evaluation, residuals={cell: np.full(len(z), size) for cell, z in evaluation.residuals.items()})
+
+
 def looked_closer(path: ModelPath, monkeypatch: pytest.MonkeyPatch, added: Any) -> tuple[Evaluation, Evaluation, bool]:
     """(the evaluation before, the closer one, is there another step?), where something stands out by a closer look."""
     before, closer = path.evaluation, replace(path.evaluation)
@@ -204,12 +208,15 @@ def looked_closer(path: ModelPath, monkeypatch: pytest.MonkeyPatch, added: Any) 
     return before, closer, another_step(path, Notes([], False))
 
 
-def test_after_a_closer_look_that_led_to_nothing_the_model_is_as_it_was(lab, monkeypatch):
-    """By which no check fails; by the closer one some might, and nobody would say of what."""
+def test_a_closer_look_stays_and_what_fails_by_it_is_looked_for(lab, monkeypatch):
+    """`compare` simulates as often: what it would fail is not called adequate by fewer replicates."""
     path = begin(bench_of(lab()))
     assert not path.failed
-    before, _, another = looked_closer(path, monkeypatch, lambda *_: False)
-    assert not another and path.evaluation is before
+    _, closer, another = looked_closer(path, monkeypatch, lambda *_: False)
+    assert not another and path.evaluation is closer
+    wrong = with_residuals(path.evaluation, 30.0)
+    monkeypatch.setattr("spadmnist.inference.model_selection.stands_out", lambda *_: setattr(path, "evaluation", wrong))
+    assert another_step(path, Notes([], False)) and path.failed
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from spadmnist.errors import SpadError
 from spadmnist.inference.comparison import Check, Comparison, holm_corrected, light_of
 from spadmnist.inference.light_levels import Nuisance
 from spadmnist.inference.null_distribution import Judgement
+from spadmnist.inference.totals_tests import Level
 from spadmnist.pages import _comparison, _figures, _frame
 from spadmnist.recording import Capture, Light
 from spadmnist.statistics import Statistic, Summary
@@ -466,7 +467,7 @@ def test_the_picture_of_the_light_shows_what_is_stated(uncertainty: float, shift
     levels = []
     for k in range(3):
         capture = Capture(f"flat-{k}", "tr", Light(500e-9, 1.0, "irradiance", uncertainty, 0.002), conditions)
-        levels.append((capture, shift + 0.001 * k, 0.003, 1.0))
+        levels.append(Level(capture, shift + 0.001 * k, 0.003, 1.0))
     nuisances, _ = light_of(levels, [])
     assert nuisances[0].capture is None and len(nuisances) == 4
     assert nuisances[0].stated == uncertainty and nuisances[1].stated == 0.002
@@ -806,5 +807,5 @@ def test_numbers_of_two_units_are_on_no_scale() -> None:
 def test_what_a_capture_is_compared_with_is_said(uncertain: float, told: str) -> None:
     conditions: Any = None
     captures = [Capture(id, "tr", Light(500e-9, 1.0, "irradiance", uncertain), conditions) for id in ("a", "b")]
-    _, checks = light_of([(capture, 0.18, 0.002, 1.0) for capture in captures], captures)
+    _, checks = light_of([Level(capture, 0.18, 0.002, 1.0) for capture in captures], captures)
     assert all(told in check.size for check in checks if check.capture), [check.size for check in checks]

@@ -405,6 +405,17 @@ def test_both_models_are_set_beside_the_data() -> None:
     assert sum(any(abs(x - a) < 0.1 and abs(y - b) < 0.1 for a, b in below[:4]) for x, y in rings) == 1
 
 
+def test_the_ring_is_where_the_sentence_says() -> None:
+    trace = replace(trace_of(), worst=30)  # cells together decide: the cell that stands for them, not the largest one
+    picture = _diagnosis._pictured([trace]).picture
+    assert picture is not None
+    data = decoded(picture.source)[1]
+    before = sorted(marks(data, f"fill: {_figures.BEFORE}"))
+    rings = marks(data, f"stroke: {_figures.WORST}")
+    assert any(abs(x - before[30][0]) < 0.1 for x, _ in rings)
+    assert f"{trace.residuals_before[30]:+.1f} sigma before" in data.decode()
+
+
 @pytest.mark.parametrize(
     "kind", ["map", "large map", "score map", "names", "rows", "many", "exact", "one", "intervals"]
 )

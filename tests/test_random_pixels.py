@@ -16,9 +16,10 @@ from spadmnist import config, measurement, twin
 from spadmnist.errors import UNABLE, SpadError
 from spadmnist.inference import hit_pixels, random_pixels
 from spadmnist.inference.candidates import with_values
+from spadmnist.inference.checks import block_checks, failing
 from spadmnist.inference.comparison import comparison_with
 from spadmnist.inference.count_model import light_levels_of
-from spadmnist.inference.evaluation import block_checks, evaluate, failing
+from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.intervals import fit_where_hit
 from spadmnist.inference.map_models import models_with_maps
 from spadmnist.inference.model_path import ModelPath, accept

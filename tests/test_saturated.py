@@ -22,6 +22,7 @@ from spadmnist.inference.mean_alone import last_digit
 from spadmnist.inference.next_step import after_comparison
 from spadmnist.inference.reduction import ReducedCapture, early_ticks, reduce_with, total_of
 from spadmnist.inference.replicates import Execution, Replicates
+from spadmnist.inference.totals_tests import Level
 from spadmnist.measurement import in_memory
 from spadmnist.recording import Capture
 from spadmnist.statistics import Statistic, Summary
@@ -345,9 +346,9 @@ def test_captures_with_several_uncertainties_are_judged_by_their_own() -> None:
     """Light that is 3 % too bright: of a level that is known exactly it is an error, of one to 5 % it is none."""
     conditions = Conditions(1.0, 1, 1.0, 1.0, 500e-9)
 
-    def level(uncertainty: float) -> tuple[Capture, float, float, float]:
+    def level(uncertainty: float) -> Level:
         light = dataclasses.replace(lit("f", "tr", 1e5, exposure=1.0).light, relative_uncertainty=uncertainty)
-        return Capture(f"to {uncertainty:g}", "tr", light, conditions), 0.03, 0.005, 1.0
+        return Level(Capture(f"to {uncertainty:g}", "tr", light, conditions), 0.03, 0.005, 1.0)
 
     def p_values(*uncertainties: float) -> list[float]:
         _, checks = comparison.light_of([level(x) for x in uncertainties], [])

@@ -16,8 +16,9 @@ from spadmnist import measurement as measurements
 from spadmnist.effects import Conditions
 from spadmnist.events import Events, Layout
 from spadmnist.inference.candidates import candidates, with_values
+from spadmnist.inference.checks import block_checks, failing
 from spadmnist.inference.error_budget import Rung, placebo_of
-from spadmnist.inference.evaluation import block_checks, evaluate, failing
+from spadmnist.inference.evaluation import evaluate
 from spadmnist.inference.held_out import captures_needed, leave_one_capture_out
 from spadmnist.inference.model_path import ModelPath, accept, begin
 from spadmnist.inference.models import Model

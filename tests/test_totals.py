@@ -15,10 +15,11 @@ from scipy import stats
 import spadmnist as sp
 from spadmnist.effects import Conditions
 from spadmnist.effects.afterpulsing import Afterpulsing
+from spadmnist.inference.checks import BlockCheck, failing
 from spadmnist.inference.count_model import CountModel
-from spadmnist.inference.evaluation import BlockCheck, Evaluation, evaluate, failing
+from spadmnist.inference.evaluation import Evaluation, evaluate
 from spadmnist.inference.findings import nuisances
-from spadmnist.inference.levels import FALSE_ALARM, SHARE_OF_TOTALS
+from spadmnist.inference.levels import FALSE_ALARM, SHARES
 from spadmnist.inference.light_levels import CaptureNull, level_error, log_levels, totals_space
 from spadmnist.inference.mean_alone import of_mean
 from spadmnist.inference.replicates import TOTALS, Execution, Replicates
@@ -114,20 +115,21 @@ def test_an_effect_that_does_not_say_what_it_adds_is_simulated_as_bright_as_the_
 
 def test_totals_have_the_share_of_false_alarms_that_compare_gives_them() -> None:
     def block(name: str, p: float) -> BlockCheck:
-        return BlockCheck((name, "map"), p, 0, 0.0)
+        return BlockCheck(("", name) if name in ("light", "rate 0", "rate 1") else (name, "map"), p, 0, 0.0)
 
     others = [block("flat", 0.5) for _ in range(50)]
-    share = SHARE_OF_TOTALS * FALSE_ALARM
-    for p, fails in ((0.4 * share, True), (0.6 * share, False)):
-        totals = [block("", p), block("", 0.5)]
-        assert failing([*totals, *others]) == ([totals[0]] if fails else [])
+    for kind, many in (("light", 1), ("rate 0", 2)):
+        share = SHARES[kind.split()[0]] * FALSE_ALARM / many
+        for p, fails in ((0.9 * share, True), (1.1 * share, False)):
+            totals = [block(name, p if name == kind else 0.5) for name in ("light", "rate 0", "rate 1")]
+            assert [b.p for b in failing([*totals, *others])] == ([p] if fails else [])
     for p, fails in ((0.9, True), (1.1, False)):  # without totals all of it is for the others
         one = block("flat", p * FALSE_ALARM / 51)
         assert failing([one, *others]) == ([one] if fails else [])
-    # false alarms of 2 totals and 50 others, all independent: of 4000 sets 40 are expected, 76 at most (1e-6)
-    rng = np.random.default_rng(1)
-    sets = rng.uniform(size=(4000, 52))
-    alarms = sum(bool(failing([block("" if k < 2 else "flat", float(p)) for k, p in enumerate(row)])) for row in sets)
+    # false alarms of 3 totals and 50 others, all independent: of 4000 sets 40 are expected, 76 at most (1e-6)
+    rng, kinds = np.random.default_rng(1), ["light", "rate 0", "rate 1", *["flat"] * 50]
+    sets = rng.uniform(size=(4000, 53))
+    alarms = sum(bool(failing([block(k, float(p)) for k, p in zip(kinds, row, strict=True)])) for row in sets)
     assert 14 < alarms < 76
 
 

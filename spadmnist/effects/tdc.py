@@ -30,6 +30,7 @@ class Tdc(Effect, stage="timing"):
         bounds=(0, None),
         off=0.0,
         search=(1e-12, 1e-8),
+        kind="multiple",  # stamps are whole ticks of the file: those of a coarser clock are whole multiples of them
     )
     rounding = parameter("nearest", "", "rounding to the nearest tick, or down", choices=("nearest", "floor"))
 

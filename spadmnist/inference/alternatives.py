@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from .evaluation import Evaluation, block_checks, failing, mean_misfit
+from .checks import block_checks, failing
+from .evaluation import Evaluation, mean_misfit
 from .replicates import Replicates
 from .results import plain
 from .scan import Scan

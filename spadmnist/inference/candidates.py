@@ -25,6 +25,7 @@ from .coordinates import Coordinate, Key, Values, coordinate_of, is_edge
 # the largest number of values of a shape within its search range: how near a template is to the true shape, against the
 # time of a scan; a rule of thumb
 _SHAPES = 4
+_MULTIPLES = (2, 5, 0.5)  # of what is listed: the first ones that are tried of a multiple; the fit finds the others
 _MOST = 6  # the largest number of templates per strength of one candidate: the time of a scan; a rule of thumb
 # factor by which the search range reaches beyond a listed value at its end or outside, so that this may rise and fall;
 # a rule of thumb
@@ -307,7 +308,9 @@ def first_strengths(coordinate: Coordinate) -> list[float]:
     if coordinate.low < 0:
         return [off + 0.1 * whole]
     if coordinate.low <= off <= coordinate.high and off > 0:
-        if coordinate.whole:  # each whole number is another model: no gradient leads to it
+        if coordinate.kind == "multiple":  # each is another model: no gradient leads to it
+            return [x for x in (off * k for k in _MULTIPLES) if coordinate.low <= x <= coordinate.high]
+        if coordinate.whole:
             near = (coordinate.value(coordinate.coordinate(x)) for x in (0.5 * off, max(1.5 * off, off + 1)))
             return [x for x in near if x != off]
         # a short move of an edge is not found by a longer one

@@ -28,14 +28,16 @@ from ..statistics import Summary
 from ..workers import Executor, executor
 from .candidates import with_values
 from .captures_together import Together, checks_together
+from .checks import holm
 from .coordinates import Values
 from .deviations import LISTED, Deviation, deviations, excess, listed
-from .evaluation import Evaluation, mean_misfit, misfit_null_95, misfits
-from .levels import FALSE_ALARM, HALF_95, LEAST_P, SHARE_OF_STATISTICS, SHARES
+from .evaluation import Evaluation, is_faint, mean_misfit, misfit_null_95, misfits
+from .levels import FALSE_ALARM, HALF_95, LEAST_P, SHARES
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
 from .null_distribution import Judgement, p_of_largest, p_of_scatter
 from .phases import evaluate_start
 from .replicates import REPLICATES, TOTALS, Cell, Execution, Replicates
+from .totals_tests import Level, along, directions
 
 _MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 _ENOUGH = 20.0  # expected detections of a pixel, from which on its ratio is compared; a rule of thumb
@@ -90,6 +92,7 @@ class Comparison:
         false_alarm_rate: probability that a right model fails.
         crop: the part of the sensor that was measured: rows, columns; None for all of it.
         full: the captures of which nearly every frame or counter is full: they test hardly anything.
+        faint: those with so few expected detections that only the total is compared.
     """
 
     sensor: str
@@ -104,6 +107,7 @@ class Comparison:
     false_alarm_rate: float = FALSE_ALARM
     crop: str | None = None
     full: tuple[str, ...] = ()
+    faint: tuple[str, ...] = ()
 
     @property
     def failing(self) -> list[Check]:
@@ -219,14 +223,15 @@ def compare(
         return comparison_of(simulations, evaluation, tolerance)
 
 
-def comparison_with(replicates: Replicates, values: Values) -> Comparison:
+def comparison_with(replicates: Replicates, values: Values, number: int | None = None) -> Comparison:
     """The comparison of the sensor with these parameters, as `compare` compares the next sensor file: in sample.
 
     Args:
         replicates: of the stated model; `compare` has as many of each capture unless the search is a quick one.
         values: by (effect, parameter), SI.
+        number: of replicates of each capture; by default as many as the search has.
     """
-    own = replicates.of_model(with_values(replicates.start, values))
+    own = replicates.of_model(with_values(replicates.start, values), number)
     evaluation, _ = evaluate_start(own)
     replicates.simulations += own.simulations
     return comparison_of(own, evaluation)
@@ -241,8 +246,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         InputError: where nothing can be compared.
     """
     checks: list[Check] = []
-    # capture, log of the light factor, its standard error, elasticity
-    levels: list[tuple[Capture, float, float, float]] = []
+    levels: list[Level] = []
     of_cells = misfits(evaluation.replicate_residuals, evaluation.residuals)
     alone = {cell: evaluation.judgements[cell].p_value for cell in evaluation.residuals if cell != TOTALS}
     together: dict[Cell, list[Together]] = {}
@@ -301,6 +305,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         tolerance=tolerance,
         crop=str(sensor.window) if sensor.window else None,
         full=tuple(id for id, seen in replicates.seen.items() if seen.is_full(sensor)),
+        faint=tuple(id for id, made in evaluation.made.items() if is_faint(made)),
     )
 
 
@@ -406,7 +411,7 @@ def _level_checks(
     capture: Capture,
     total: float,
     made: CaptureNull,
-    levels: list[tuple[Capture, float, float, float]],
+    levels: list[Level],
 ) -> list[Check]:
     """The check of the total of a dark capture; for a lit one its light level is appended to `levels`."""
     if made.stated is None:
@@ -415,7 +420,8 @@ def _level_checks(
     if not capture.light.dark and not lost:
         level, error, elasticity = made.level_of(max(total, 0.5))
         if elasticity > LEAST_ELASTICITY:
-            levels.append((capture, math.log(level / made.stated), error, elasticity))
+            log = math.log(level / made.stated)
+            levels.append(Level(capture, log, error, elasticity=elasticity, freedom=made.freedom))
             return []
         lost = True
     mean = made.total_at(made.stated)
@@ -434,25 +440,27 @@ def _level_checks(
     ]
 
 
-def light_of(
-    levels: Sequence[tuple[Capture, float, float, float]], captures: Sequence[Capture]
-) -> tuple[list[Nuisance], list[Check]]:
+def light_of(levels: Sequence[Level], captures: Sequence[Capture]) -> tuple[list[Nuisance], list[Check]]:
     """(nuisance parameters, checks): the common light factor and each capture's own, against the stated levels.
 
     The factor of a capture is the common one to the power of its relative uncertainty over the largest.
 
     Args:
-        levels: (capture, log of the light factor, its standard error, elasticity) of each lit capture.
+        levels: of each lit capture.
         captures: all captures.
     """
     if not levels:
         return [], []
-    x = np.array([log for _, log, _, _ in levels])
-    error = np.array([math.hypot(e, c.light.own_uncertainty) for c, _, e, _ in levels])
-    error = np.maximum(error, 1e-6)
-    uncertain = np.array([c.light.relative_uncertainty for c, _, _, _ in levels])
+    x = np.array([one.log for one in levels])
+    estimated = np.maximum([one.error for one in levels], 1e-6)
+    error = np.hypot(estimated, [one.capture.light.own_uncertainty for one in levels])
+    uncertain = np.array([one.capture.light.relative_uncertainty for one in levels])
     common = float(uncertain.max())
     follows = uncertain / common if common > 0 else np.ones(len(levels))  # the common factor, to this power
+    root = np.linalg.inv(np.linalg.cholesky(np.diag(error**2) + np.outer(uncertain, uncertain)))
+    vectors, _ = directions(list(uncertain), [True] * len(levels))
+    freedom = np.array([one.freedom for one in levels])
+    *of_captures, (pull, p_light) = along(root, root @ x, vectors, estimated, freedom)
     weight = 1 / error**2
     informed = (weight * follows**2).sum()
     total_weight = informed + (1 / common**2 if common > 0 else 1e18)
@@ -460,8 +468,6 @@ def light_of(
     best = projection / total_weight
     spread = 1 / math.sqrt(total_weight)
     own = projection / informed  # the estimate of the captures alone, without the stated level
-    own_error = 1 / math.sqrt(informed)
-    pull = own / math.hypot(common, own_error)
     name = "light"
     low, high = (math.exp(best + k * spread) for k in (-HALF_95, HALF_95))
     nuisances = [Nuisance(capture=None, name=name, value=math.exp(best), low=low, high=high, pull=pull, stated=common)]
@@ -470,18 +476,17 @@ def light_of(
             statistic=name,
             capture=None,
             misfit=pull**2,
-            p_value=float(2 * stats.norm.sf(abs(pull))),
+            p_value=p_light,
             where="all lit captures",
             size=f"light {100 * math.expm1(own):+.2f} % relative to the stated level, known to {100 * common:.2f} %",
             relative=math.expm1(own),
         )
     ]
-    for (capture, log, _, elasticity), e, power in zip(levels, error, follows, strict=True):
+    for (capture, log, _, elasticity, _), e, power, (z, p) in zip(levels, error, follows, of_captures, strict=True):
         # the common factor by the other captures and the stated level
         by_level, by_others = 1 / common**2 if common > 0 else 1e18, informed - power**2 / e**2
         others = by_others + by_level
         mean = power * (projection - power * log / e**2) / others
-        z = (log - mean) / math.sqrt(e**2 + power**2 / others)
         if capture.light.own_uncertainty > 0:
             low, high = (math.exp(log + k * e) for k in (-HALF_95, HALF_95))
             stated = capture.light.own_uncertainty
@@ -496,7 +501,7 @@ def light_of(
                 statistic="rate",
                 capture=capture.id,
                 misfit=z * z,
-                p_value=float(2 * stats.norm.sf(abs(z))),
+                p_value=p,
                 where="all pixels",
                 size=size,
                 relative=change,
@@ -510,16 +515,7 @@ def holm_corrected(checks: Sequence[Check], tolerance: float | None) -> list[Che
     # the light, the totals and the statistics have a share each of the false alarms, so that a wrong power meter is
     # not lost among a hundred statistics
     kinds = [c.statistic if c.statistic in SHARES else "" for c in checks]
-    tests = {kind: sum(c.tests for c, its in zip(checks, kinds, strict=True) if its == kind) for kind in kinds}
-    weights = [SHARES.get(kind, SHARE_OF_STATISTICS) / tests[kind] for kind in kinds]
-    order = sorted(range(len(checks)), key=lambda i: checks[i].p_value / weights[i])
-    failing: set[int] = set()
-    left = sum(weight * check.tests for weight, check in zip(weights, checks, strict=True))
-    for i in order:
-        if checks[i].p_value > FALSE_ALARM * weights[i] / max(left, 1e-12):
-            break
-        failing.add(i)
-        left -= weights[i]
+    failing = holm([c.p_value for c in checks], kinds, [c.tests for c in checks], FALSE_ALARM)
     out = []
     for i, check in enumerate(checks):
         material = i in failing and (tolerance is None or not abs(check.relative) < tolerance)

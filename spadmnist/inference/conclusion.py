@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ..effects import Mimic
+from .checks import BlockCheck
 from .comparison import Comparison
 from .error_budget import Rung
-from .evaluation import BlockCheck, Evaluation, mean_misfit, misfit_null_95
-from .findings import levels_of, nuisances, remainder, traces
+from .evaluation import Evaluation, mean_misfit, misfit_null_95
+from .findings import failing_of, levels_of, nuisances, remainder, traces
 from .levels import HALF_95
 from .model_path import ModelPath
 from .results import Diagnosis, Step, Value, plain
@@ -68,20 +69,24 @@ def left_over(path: ModelPath, notes: Notes) -> list[BlockCheck]:
     return [] if among and all(b.cell[0] == "" for b in left) else left
 
 
-def so_far(path: ModelPath, start: Evaluation, notes: Notes) -> Diagnosis:
+def so_far(path: ModelPath, notes: Notes) -> Diagnosis:
     """The diagnosis while the search goes on."""
     verdict = verdict_of(path, left_over(path, notes), notes)
     null_95 = misfit_null_95(path.ladder[0].evaluation.replicate_residuals)
-    found = answer(path, start, notes, verdict, LastLook(path.ladder, null_95))
+    found = answer(path, notes, verdict, LastLook(path.ladder, null_95))
     found.steps = [replace(step, alternatives=[public(other) for other in step.alternatives]) for step in path.steps]
     found.finished = False
     found.untried = [*found.untried, not_done("further steps", "the search goes on")]
     return found
 
 
-def unexplained_by(path: ModelPath) -> list[dict[str, Any]]:
-    """What the steps leave unexplained, for the JSON data; the nearest candidates are alternatives of the first."""
-    found = remainder(path.replicates, path.evaluation, path.evaluation.residuals)
+def unexplained_by(path: ModelPath, in_sample: Comparison | None = None) -> list[dict[str, Any]]:
+    """What the steps leave unexplained, for the JSON data; the nearest candidates are alternatives of the first.
+
+    Args:
+        in_sample: the comparison of the model, whose failing checks are listed where no other one fails.
+    """
+    found = remainder(path.replicates, path.evaluation, path.evaluation.residuals) or failing_of(in_sample)
     if found and path.nearest:
         found[0]["alternatives"] = [_nearest(step) for step in path.nearest]
     return found
@@ -121,11 +126,10 @@ class LastLook:
     in_sample: Comparison | None = None
 
 
-def answer(path: ModelPath, start: Evaluation, notes: Notes, verdict: str, last: LastLook) -> Diagnosis:
+def answer(path: ModelPath, notes: Notes, verdict: str, last: LastLook) -> Diagnosis:
     """The diagnosis.
 
     Args:
-        start: the evaluation of the model without steps.
         last: what is measured at the end; of a search that goes on, the rows so far.
     """
     replicates = path.replicates
@@ -143,13 +147,13 @@ def answer(path: ModelPath, start: Evaluation, notes: Notes, verdict: str, last:
         nuisances=nuisances(replicates, path.evaluation) if last.in_sample is None else levels_of(last.in_sample),
         steps=path.steps,
         setup=notes.setup,
-        unexplained=unexplained_by(path) if remains else [],
+        unexplained=unexplained_by(path, last.in_sample) if remains else [],
         ladder=[rung.row for rung in last.rungs],
         advice=notes.advice,
         excluded=excluded,
         invisible=invisible,
         unlimited=unlimited,
-        traces=traces(replicates, start, path.evaluation, path.steps),
+        traces=traces(replicates, path.start, path.evaluation, path.steps),
         values=path.sensor_values,
         simulations=replicates.simulations,
         dark=replicates.dark,

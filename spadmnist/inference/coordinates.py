@@ -52,8 +52,33 @@ class Coordinate:
 
     @property
     def whole(self) -> bool:
-        """Whether the parameter has whole values only."""
-        return self.kind == "count"
+        """Whether the parameter has whole values only, or whole multiples and whole parts of what is listed."""
+        return self.kind == "count" or (self.kind == "multiple" and bool(self.off))
+
+    def beside(self, value: float, by: int) -> float:
+        """The whole value that is so many further up, or down where negative, in the parameter's unit."""
+        if self.kind == "count":
+            return value + by
+        for _ in range(abs(by)):
+            number = round(value / self._unit) if value > 0.999 * self._unit else -round(self._unit / value)
+            number += 1 if by > 0 else -1
+            number = {0: -2, -1: 1}.get(number, number)  # 1/2, 1, 2
+            value = self._unit * number if number > 0 else self._unit / -number
+        return value
+
+    @property
+    def _unit(self) -> float:
+        """That of which whole values are multiples, in the parameter's unit."""
+        return float(self.off or 1.0) if self.kind == "multiple" else 1.0
+
+    def rounded(self, value: float) -> float:
+        """The nearest value that there is, in the parameter's unit."""
+        if not self.whole:
+            return value
+        if self.kind == "count":
+            return float(round(value))
+        many = value / self._unit
+        return self._unit * round(many) if many >= 1 else self._unit / round(1 / max(many, 1e-12))
 
     @property
     def log(self) -> bool:
@@ -114,13 +139,13 @@ class Coordinate:
     def _anywhere(self, coordinate: float) -> float:
         value = math.exp(min(coordinate, 700.0)) if self.log else coordinate
         value = self.high - value if self.lacks else value
-        return float(round(value)) if self.whole else value
+        return self.rounded(value)
 
     def scaled(self, value: float, factor: float) -> float:
         """The value, within the search range, whose distance from `off` is `factor` times that of `value`."""
         off = self.off or 0.0
         found = off + (value - off) * factor
-        return min(max(float(round(found)) if self.whole else found, self.low), self.high)
+        return min(max(self.rounded(found), self.low), self.high)
 
 
 def coordinate_of(effect: str, declared: Parameter, off: float | None) -> Coordinate:
@@ -160,4 +185,5 @@ def room_of(coordinate: Coordinate, value: float) -> float:
 
 def is_edge(coordinate: Coordinate) -> bool:
     """Whether a strength is an edge, a time or a distance to its upper end: no signature is proportional to it."""
-    return coordinate.lacks or (coordinate.kind in ("time", "edge") and coordinate.off is not None)
+    times = coordinate.kind in ("time", "edge") or (coordinate.kind == "multiple" and not coordinate.whole)
+    return coordinate.lacks or (times and coordinate.off is not None)

@@ -10,19 +10,12 @@ import numpy as np
 
 from ..errors import SpadError
 from .capture_replicates import CannotSimulate
-from .evaluation import (
-    Evaluation,
-    as_compared,
-    block_checks,
-    failing,
-    log_likelihood_ratio,
-    mean_misfit,
-    square,
-    stacked,
-)
+from .checks import block_checks, failing
+from .evaluation import Evaluation, as_compared, log_likelihood_ratio, mean_misfit, square, stacked
 from .gauss_newton import Effort, Fit, column_of, gauss_newton
 from .joint_fit import LOST, RISEN, SAME, WORTH, fit_all, informing, rise_of, without_fit
 from .levels import CLEARLY, LEAST_EVIDENCE, LEAST_FALL, OWN_CELLS
+from .light_levels import totals_space, whole_of
 from .model_path import ModelPath, keys_of, rests_on
 from .models import Model
 from .replicates import TOTALS, Cell
@@ -36,6 +29,7 @@ _MOSTLY = 0.95
 _NOISE = 3.0  # standard deviations of the mean square of as many cells: excess misfit up to this is noise
 # steps that explain too little of their own cells, after which no further one is tried: no effect here is the right one
 _VAIN = 2
+_MOVES = 0.1  # of a step's score in all totals: a capture that has less of it is none whose total it moves
 # in chi square: a step is kept if a fit to first order without it is worse by more, far above `_NEEDLESS`; otherwise it
 # is fitted again
 _NEEDED = 90.0
@@ -223,14 +217,15 @@ def drop_unexplaining(path: ModelPath, start: Evaluation, totals: bool) -> None:
     """
     while path.steps and any(totals or block.cell[0] for block in path.failed):
         # what one step leaves, another one cannot explain: the worst goes first, and the others are judged again
-        left = {id(s): left_in_own_cells(s, path.held_out, totals) for s in path.steps}
+        left = {id(s): left_by(s, path, totals) for s in path.steps}
         worst = max(path.steps, key=lambda s: left[id(s)])
         now, then = (
             mean_misfit(evaluation.replicate_residuals, evaluation.residuals) for evaluation in (path.evaluation, start)
         )
+        worse = now > then and square(path.evaluation.residuals) > square(start.residuals)  # the totals included
         mostly = len(path.steps) == 1 and then - now > _MOSTLY * (then - 1) > 0
         kept = [s for s in path.steps if not (s is worst or rests_on(s, worst, path)) or left[id(worst)] < 1 or mostly]
-        if now > then:
+        if worse:
             kept = []
         if len(kept) == len(path.steps):
             return
@@ -255,11 +250,39 @@ def no_step_explains(path: ModelPath, totals: bool) -> bool:
     Args:
         totals: see `drop_unexplaining`.
     """
-    left = [left_in_own_cells(step, path.held_out, totals) for step in path.steps]
+    left = [left_by(step, path, totals) for step in path.steps]
     return len(left) >= _VAIN and bool(path.failed) and all(1 <= x < math.inf for x in left)
 
 
-def left_in_own_cells(step: Step, residuals: Mapping[Cell, np.ndarray], totals: bool) -> float:
+def left_by(step: Step, path: ModelPath, totals: bool) -> float:
+    """As `left_in_own_cells`, of the path as it is, with data that the step was not fitted to."""
+    return left_in_own_cells(step, path.held_out, totals, _has_totals_alone(step, path))
+
+
+def _has_totals_alone(step: Step, path: ModelPath) -> bool:
+    """Whether a step is one of totals, and all else that fails is in captures whose totals it does not move.
+
+    What else fails in a capture may be the cause of its total; what fails in others is not.
+    """
+    ids, _, root, _ = totals_space(path.replicates, path.evaluation)
+    template = step.template.get(TOTALS, np.zeros(0))
+    shapes = sum(float(t @ t) for cell, t in step.template.items() if cell != TOTALS)
+    if not ids or len(template) != len(ids) or float(template @ template) <= shapes:
+        return False
+    logs = np.linalg.solve(root, template)  # of the levels
+    scores = logs**2 * np.sum(root**2, axis=0)  # by each capture's own total, the others given
+    moved = scores > _MOVES * scores.sum()
+    own = {whole_of(path.replicates, id) for id, moves in zip(ids, moved, strict=True) if moves}
+    fail: set[str] = set()
+    for block in path.failed:
+        cells = [block.cell] if block.together is None else block.together.cells
+        fail |= {whole_of(path.replicates, cell[0]) for cell in cells if cell[0]}
+    return not own & fail
+
+
+def left_in_own_cells(
+    step: Step, residuals: Mapping[Cell, np.ndarray], totals: bool, totals_alone: bool = False
+) -> float:
     """The excess misfit left in a step's own cells, relative to the most that a finding may leave.
 
     Its own cells carry most of its expected score. From 1 on the step only resembles what is there.
@@ -267,9 +290,10 @@ def left_in_own_cells(step: Step, residuals: Mapping[Cell, np.ndarray], totals: 
     Args:
         residuals: (cells,) by block, of data that the step was not fitted to.
         totals: the totals are among its cells.
+        totals_alone: nothing else fails in the captures whose totals it moves; they are judged as other cells are.
     """
     cells = [
-        (t, residuals[cell], step.before[cell], np.full(len(t), cell != TOTALS))
+        (t, residuals[cell], step.before[cell], np.full(len(t), totals_alone or cell != TOTALS))
         for cell, t in step.template.items()
         if (totals or cell != TOTALS)
         and cell in residuals
@@ -287,7 +311,7 @@ def left_in_own_cells(step: Step, residuals: Mapping[Cell, np.ndarray], totals: 
     own = order[: int(np.searchsorted(np.cumsum(score[order]), OWN_CELLS * score.sum())) + 1]
     # the fall of a faint one is in all of its cells; in the others, another step may have made it a rise
     explained = max(float(fell.sum()), float(fell[own].sum()))
-    # of totals alone, any effect may be the cause
+    # of totals beside other traces, what those are of may be the cause
     if explained < LEAST_EVIDENCE or score[shapes].sum() < 0.5 * score.sum():
         return math.inf
     left, excess = float(np.mean(now[own] ** 2)) - 1, float(np.mean(before[own] ** 2)) - 1

@@ -1,7 +1,4 @@
-"""The evaluation of a model: residuals of the data, likelihood ratio, checks of the goodness of fit.
-
-Every statistic of every capture is a check. Holm's correction keeps false alarms to one comparison in a hundred.
-"""
+"""The evaluation of a model: residuals of the data, likelihood ratio, misfit."""
 
 from __future__ import annotations
 
@@ -11,17 +8,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from ..errors import UNABLE, SpadError, why
 from ..statistics import Summary
 from . import replicate_cache
 from .candidates import with_values
 from .capture_replicates import CannotSimulate, CaptureReplicates, joined
-from .captures_together import Together, checks_together
 from .closed_forms import most_detections
 from .coordinates import Key, Values
-from .levels import FALSE_ALARM, SHARE_OF_TOTALS
 from .light_levels import CaptureNull, central_level, law_of, levels_about, matched_light, own_totals, totals_residuals
 from .mean_alone import of_mean
 from .models import Model
@@ -35,6 +29,9 @@ _PIECES = 4  # tasks of one capture, at most: the number of workers that share i
 # sum of squares of a signature in one statistic, in variances, above which its cells count in the likelihood ratio: a
 # smaller one is less than the noise of one number
 _MOVED = 1.0
+# expected detections of a capture, least, of which more than the total is compared. Scores of 0.1 expected detections
+# alarmed 3000 times too often (p < 1e-6), of 2 up to 300 times, of 30 rightly
+_FEW_DETECTIONS = 5.0
 _WIDEST = 2.3  # of the log of the ratio of two scatters: the most that counts, a factor of 10
 # standard errors of that log: a cell beyond has another scatter and counts; by the normal law 3 of 1000 do by chance
 _OTHER_SCATTER = 3.0
@@ -227,6 +224,8 @@ def _evaluate(
             level=centre, stated=stated, totals=made.totals, expected=expected, law=law, scatter=scatter, most=most
         )
         evaluation.factors[id] = factors
+        if is_faint(made):
+            continue  # replicates without a detection are all alike: one detection would be any number of sigma
         for name, summary in replicates.seen[id].summaries.items():
             if name not in made.values:
                 continue
@@ -243,6 +242,11 @@ def _evaluate(
         replicate_cache.make_room()
     _compare_totals(replicates, evaluation, n)
     return evaluation
+
+
+def is_faint(made: CaptureReplicates) -> bool:
+    """Whether the replicates of a capture have so few detections that its total alone is compared."""
+    return float(made.totals.mean()) < _FEW_DETECTIONS
 
 
 def _compare_totals(replicates: Replicates, evaluation: Evaluation, number: int) -> None:
@@ -444,92 +448,3 @@ def misfit_null_95(replicate_residuals: Mapping[Cell, np.ndarray]) -> float:
         return 1.2
     n = min(map(len, squares))
     return float(np.quantile(np.mean([x[:n] / max(x[:n].mean(), 1e-30) for x in squares], axis=0), 0.95))
-
-
-@dataclass(frozen=True)
-class BlockCheck:
-    """A check: a block of cells, or the totals.
-
-    Attributes:
-        p: p-value, see `Null.p_value`.
-        worst: the cell that shows it most; z: its residual.
-        tests: the number of tests of which p is the smallest p-value.
-        together: where p is that of several captures together, their check.
-        contrast: the index of the contrast, where one decides.
-    """
-
-    cell: Cell
-    p: float
-    worst: int
-    z: float
-    tests: int = 1
-    together: Together | None = None
-    contrast: int | None = None
-
-    @property
-    def shown(self) -> Cell:
-        """The block that shows it: of several captures together, the one in which it is clearest."""
-        return self.cell if self.together is None else self.together.clearest
-
-
-def block_checks(
-    replicates: Replicates, evaluation: Evaluation, residuals: Mapping[Cell, np.ndarray]
-) -> list[BlockCheck]:
-    """The checks of an evaluation with these residuals of the data, by p-value.
-
-    Args:
-        residuals: (cells,) by block.
-    """
-    out, alone = [], dict[Cell, tuple[float, int, int | None]]()
-    for cell, z in residuals.items():
-        if cell == TOTALS:
-            out += [
-                BlockCheck(cell=("", f"rate {k}"), p=float(2 * stats.norm.sf(abs(v))), worst=k, z=float(v))
-                for k, v in enumerate(z)
-            ]
-        else:
-            alone[cell] = evaluation.nulls[cell].p_value(z)
-    several: dict[Cell, list[Together]] = {}
-    for check in checks_together(replicates, evaluation, residuals, {cell: p for cell, (p, *_) in alone.items()}):
-        several.setdefault(check.cell, []).append(check)
-    for cell, (p, worst, contrast) in alone.items():
-        here = several.get(cell, [])
-        least, tests = min(here, key=lambda check: check.p, default=None), 1 + len(here)
-        if least is not None and least.p < p:
-            out.append(
-                BlockCheck(
-                    cell=cell,
-                    p=least.p,
-                    worst=least.worst,
-                    z=least.z,
-                    tests=tests,
-                    together=least,
-                    contrast=least.contrast,
-                )
-            )
-        else:
-            z_worst = float(residuals[cell][worst])
-            out.append(BlockCheck(cell=cell, p=p, worst=worst, z=z_worst, tests=tests, contrast=contrast))
-    out += [BlockCheck(cell=cell, p=1e-12, worst=0, z=40.0) for cell in evaluation.exact]
-    return sorted(out, key=lambda b: (b.p, -abs(b.z)))
-
-
-def failing(checks: Sequence[BlockCheck], level: float = FALSE_ALARM) -> list[BlockCheck]:
-    """The checks that fail by Holm's correction at a familywise level, by p-value.
-
-    The totals together have the same share of the level as in `compare`; all other checks have the rest.
-
-    Args:
-        level: probability that a right model fails any.
-    """
-    totals = sum(block.cell[0] == "" for block in checks)
-    others = sum(block.tests for block in checks) - totals
-    share = SHARE_OF_TOTALS if totals and others else float(bool(totals))
-    weights = [share / totals if block.cell[0] == "" else (1 - share) / others for block in checks]
-    out, left = [], 1.0
-    for block, weight in sorted(zip(checks, weights, strict=True), key=lambda pair: pair[0].p / pair[1]):
-        if block.p > level * weight / max(left, weight):
-            break
-        out.append(block)
-        left -= weight
-    return sorted(out, key=lambda block: (block.p, -abs(block.z)))

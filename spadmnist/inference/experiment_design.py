@@ -16,7 +16,7 @@ from ..foreign import visible
 from ..recording import Capture, Light, Recording
 from .candidates import Candidate
 from .capture_replicates import CannotSimulate
-from .closed_forms import closed_form
+from .closed_forms import closed_form, most_detections
 from .evaluation import Evaluation, evaluate, square
 from .light_levels import level_error
 from .models import InTheDark, Model
@@ -34,7 +34,8 @@ _RECORDINGS = 16  # replicates of a capture that was not taken yet
 _MOST_EVENTS = 6e5  # detections of a longer capture, at most; a brighter one may have twice as many
 _LONG = 100.0  # s of a long dark capture
 _LONGER = 10.0  # factor on the exposure of a lit capture that is taken again, at most
-_LEAST_COUNTS = 0.5  # detections: fewer expected ones are as many, where captures are compared
+_LEAST_COUNTS = 0.5  # detections: the least variance of a count, where captures are compared; a rule of thumb
+_CALIBRATED = 1e-3  # relative: how well the light of a further capture is known beside the first; a rule of thumb
 _MOST_FRAMES = 4.0  # the same for frames, which cost time even where they are empty
 
 
@@ -168,18 +169,19 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
             words = f"{_seen_in(brighter)} {'a tenth' if times < 1 else 'ten times'} as bright as {id}"
             tries.append((words, brighter, logs.get(id, 0.0)))
     assert other.sensors is not None
-    for words, capture, expected in tries:
+    for words, capture, log in tries:
         level = 1.0 if capture.light.dark else twin.photons_at(capture, replicates.start.layout) or 1.0
-        plain_, changed = (
-            closed_form(InTheDark.of(s) if capture.light.dark else s, capture)(level)
-            for s in (sensor, other.sensors.mean_sensor(model.id))
-        )
-        some, more = max(plain_, _LEAST_COUNTS), max(changed, _LEAST_COUNTS)
-        apart = abs(math.log(more / some) - expected)
-        z = apart / math.sqrt(1 / max(some, more) + capture.light.own_uncertainty**2 + 1e-6)
+        # the sensor as it is in the light of the set-up, and the other one in the stated light
+        either = (sensor, level * math.exp(log)), (other.sensors.mean_sensor(model.id), level)
+        some, more = sorted(closed_form(InTheDark.of(s) if capture.light.dark else s, capture)(x) for s, x in either)
+        most = most_detections(capture, sensor.layout.pixels)
+        free = 1.0 - min(more / most, 1.0) if math.isfinite(most) else 1.0  # frames that are full say nothing
+        light = capture.light.own_uncertainty**2 + _CALIBRATED**2
+        z = (more - some) / math.sqrt(max(more * free, _LEAST_COUNTS) + light * (more * free) ** 2)
         if best is None or z > best[0]:
             best = z, words
-    assert best is not None
+    if best is None or best[0] < 1.0:
+        return []  # none of them separates the two
     return [_advice(best[1], [setup.factors[0].quantity, other.candidate.effect], now, math.hypot(now, best[0]))]
 
 

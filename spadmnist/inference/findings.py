@@ -13,12 +13,14 @@ from ..effects import Mimic
 from ..recording import Capture
 from ..statistics import Statistic
 from . import comparison
+from .checks import LIGHT, BlockCheck, block_checks, failing
 from .deviations import Deviation, deviations, excess
-from .evaluation import BlockCheck, Evaluation, block_checks, failing
+from .evaluation import Evaluation
 from .levels import LEAST_P
 from .light_levels import LEAST_ELASTICITY, Nuisance, totals_space
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
+from .totals_tests import Level
 
 # deviations that have pictures, and captures of each, at most: the length of a page; rules of thumb
 _PICTURES, _CAPTURES = 6, 4
@@ -80,13 +82,13 @@ def _failed(
     id, name = block.cell
     if id == "":
         ids, *_ = totals_space(replicates, evaluation)
-        which = ids[block.worst] if block.worst < len(ids) else None
+        light = block.cell == LIGHT
         return Deviation(
-            statistic="rate",
-            capture=which,
+            statistic="light" if light else "rate",
+            capture=None if light else ids[block.worst],
             excess=block.z**2,
             worst=0,
-            where="all pixels",
+            where="all lit captures" if light else "all pixels",
             size=0.0,
             residuals=np.zeros(0),
         ), ""
@@ -122,6 +124,22 @@ def _shown(checks: Sequence[BlockCheck]) -> tuple[list[BlockCheck], set[Cell]]:
     for block in failing(checks):
         failed.setdefault(block.shown, block)  # the one with the smallest p-value
     return list(failed.values()), {block.cell for block in checks} - failed.keys()
+
+
+def failing_of(found: comparison.Comparison | None) -> list[dict[str, Any]]:
+    """The failing checks of a comparison as `remainder` lists them, each a deviation of its own; none of None."""
+    checks = [] if found is None else sorted(found.failing, key=lambda check: check.p_value)
+    return [
+        {
+            "statistic": check.statistic,
+            "capture": check.capture,
+            "significance": plain(float(stats.norm.isf(check.p_value / 2))),
+            "where": check.where,
+            "size": check.size,
+            "deviation": number,
+        }
+        for number, check in enumerate(checks, 1)
+    ]
 
 
 def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: Sequence[Step] = ()) -> list[Trace]:
@@ -160,6 +178,7 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: S
                     deviation=number,
                     first=i == members[0],
                     step=int(np.argmax(moved)) if moved and max(moved) > _MOVED else None,
+                    worst=one.worst,
                 )
             )
     return out
@@ -167,7 +186,7 @@ def traces(replicates: Replicates, start: Evaluation, last: Evaluation, steps: S
 
 def nuisances(replicates: Replicates, evaluation: Evaluation) -> list[dict[str, Any]]:
     """The common light level and each capture's own, with 95 % intervals and pulls, for the JSON data."""
-    levels: list[tuple[Any, float, float, float]] = []
+    levels: list[Level] = []
     for id, seen in replicates.seen.items():
         null = evaluation.rates[id]
         if seen.capture.light.dark or null.stated is None:
@@ -175,7 +194,8 @@ def nuisances(replicates: Replicates, evaluation: Evaluation) -> list[dict[str, 
         level, error, elasticity = null.level_of(max(seen.total, 0.5))
         if elasticity <= LEAST_ELASTICITY or null.says_nothing(seen.total):
             continue  # no light level gives so few
-        levels.append((seen.capture, math.log(level / null.stated), error, elasticity))
+        log = math.log(level / null.stated)
+        levels.append(Level(seen.capture, log, error, elasticity=elasticity, freedom=null.freedom))
     found, _ = comparison.light_of(levels, [s.capture for s in replicates.seen.values()])
     return _as_data(found)
 

@@ -12,10 +12,11 @@ from ..errors import UNABLE, SpadError, why
 from .alternatives import alternatives
 from .budget import OutOfBudget
 from .candidates import Candidate
+from .checks import BlockCheck
 from .conclusion import Notes, not_done
-from .elimination import left_in_own_cells
+from .elimination import left_by
 from .error_budget import placebo_of
-from .evaluation import BlockCheck, Evaluation, evaluate
+from .evaluation import evaluate
 from .evidence import NEAR, apart_from, best_of, competing, evidence_of, judge_maps_by_odd_pixels, leads, worth_fitting
 from .joint_fit import complete_fit
 from .levels import FALSE_ALARM, LEAST_EVIDENCE, PROMISING
@@ -171,7 +172,7 @@ def best_of_scan_added(path: ModelPath, notes: Notes, failed: Sequence[BlockChec
     if doubtful is not None:
         path.back_to(doubtful)
     elif not (faint or refused) and has_few_replicates(path):
-        path.evaluation = with_more_replicates(path)  # something is wrong: too few replicates may be what hides it
+        look_closer(path)  # something is wrong: too few replicates may be what hides it
         return True
     return False
 
@@ -330,14 +331,14 @@ def _taken(
             complete(path)  # what no check shows is decided by the fit of all numbers
     if not failed and path.failed and has_few_replicates(path):
         with _needed(best.candidates, "a closer look"):
-            path.evaluation = with_more_replicates(path)  # with as many replicates as the model without the step
+            look_closer(path)  # with as many replicates as the model without the step
     if not failed and path.failed:
         path.back_to(earlier)  # no check failed before, now one does
         return False
 
     # the totals are no part of the misfit: with fewer failing checks it is a step, whatever noise does to the rest
     def helps_too_little() -> bool:
-        explains = all(left_in_own_cells(step, path.held_out, not notes.explained) < 1 for step in new)
+        explains = all(left_by(step, path, not notes.explained) < 1 for step in new)
         more = len(path.failed) >= max(len(failed), 1)
         return not explains and more and fell - path.misfit < _LEAST_FALL_OF_MISFIT * (fell - 1)
 
@@ -373,7 +374,11 @@ def has_few_replicates(path: ModelPath) -> bool:
     return len(path.evaluation.replicate_residuals[TOTALS]) < CLOSER
 
 
-def with_more_replicates(path: ModelPath) -> Evaluation:
-    """The evaluation of the model with more replicates."""
+def look_closer(path: ModelPath) -> None:
+    """Evaluate the model with more replicates; without steps it is the stated model that later ones are judged by."""
     path.replicates.say(f"more replicates of the model: {CLOSER} of each capture")
-    return evaluate(path.replicates, path.evaluation.values, path.evaluation.sensors, CLOSER, path.evaluation)
+    own = path.evaluation
+    path.evaluation = evaluate(path.replicates, own.values, own.sensors, CLOSER, own)
+    if not path.steps:
+        path.ladder.clear()
+        path.rung("start")

@@ -93,6 +93,11 @@ class CaptureNull:
         return self.scatter * math.sqrt(1 + 2 / len(self.totals))
 
     @property
+    def freedom(self) -> float:
+        """Degrees of freedom of `scatter`: the law of the totals has two numbers."""
+        return float(max(len(self.totals) - 2, 1))
+
+    @property
     def saturated(self) -> bool:
         """Whether the total does not depend on the light at the stated level: frames, counters or a bus are full."""
         return self.stated is not None and self.elasticity_at(self.stated) < LEAST_ELASTICITY
@@ -347,6 +352,24 @@ def level_error(replicates: Replicates, evaluation: Evaluation, id: str) -> floa
         apart = abs(math.log(level / stated))
         error = apart / abs(z) if abs(z) > _SOME else max(error, apart / _SOME)
     return max(math.hypot(error, light.own_uncertainty), 1e-6)
+
+
+def estimated_errors(
+    replicates: Replicates, evaluation: Evaluation, ids: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(the part of each `level_error` that the scatter of the replicates gives, its degrees of freedom), (captures,).
+
+    A score by the counts' own law is no estimate: its part is 0.
+    """
+    parts, freedom = [], []
+    for id in ids:
+        null, seen = evaluation.rates[id], replicates.seen[id]
+        by_law = seen.capture.light.dark or null.says_nothing(seen.total)
+        error = level_error(replicates, evaluation, id)
+        own = seen.capture.light.own_uncertainty
+        parts.append(0.0 if by_law else math.sqrt(max(error**2 - own**2, 0.0)))
+        freedom.append(null.freedom)
+    return np.array(parts), np.array(freedom)
 
 
 def score_of_total(

@@ -15,10 +15,11 @@ from ..sensor import Sensor
 from ..units import rounded
 from . import count_model, held_out, map_models, pixel_maps
 from .candidates import Candidate, with_values
+from .checks import BlockCheck, block_checks, failing
 from .coordinates import Coordinate, Key
 from .count_model import light_levels_of
 from .error_budget import HeldMaps, Rung, physical_errors
-from .evaluation import BlockCheck, Evaluation, block_checks, failing, mean_misfit
+from .evaluation import Evaluation, mean_misfit
 from .evidence import evaluation_of
 from .gauss_newton import Fit
 from .hit_pixels import PixelsHit, of_pixels, pixels_hit
@@ -63,6 +64,11 @@ class ModelPath:
     approximate: bool = False  # the Jacobian of `fit`, or the maps, are those of models near by
     # (pixels,) bool by effect: the pixels that it has hit, of the effects that the model has in exactly these
     located: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def start(self) -> Evaluation:
+        """The evaluation of the stated model."""
+        return self.ladder[0].evaluation
 
     @property
     def is_rough(self) -> bool:

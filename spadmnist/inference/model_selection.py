@@ -21,20 +21,21 @@ from ..sensor import Sensor
 from ..workers import Executor, executor
 from . import experiment_design, setups, time_blocks, upper_limits
 from .budget import ERRORS, FITS, STEPS, Budget, OutOfBudget, clock
+from .checks import block_checks, failing
 from .comparison import Comparison, comparison_of, comparison_with, nothing_to_compare
 from .conclusion import LastLook, Limits, Notes, answer, left_over, outside, rival_step, so_far, too_short, verdict_of
 from .elimination import drop_needless, drop_unexplaining, no_step_explains
 from .error_budget import Rung
-from .evaluation import Evaluation, as_compared, block_checks, failing, misfit_null_95, with_totals_anew
+from .evaluation import Evaluation, as_compared, misfit_null_95, with_totals_anew
 from .findings import mimicked
 from .forward_step import (
     added_from,
     best_added,
     complete,
     has_few_replicates,
+    look_closer,
     or_as_before,
     record_end,
-    with_more_replicates,
 )
 from .intervals import fit_where_hit, open_ends, scale_errors, sharpen
 from .joint_fit import completed, with_own_errors
@@ -116,11 +117,11 @@ def _diagnosed(
     path = begin(replicates)
     if not any(z.size for z in path.evaluation.residuals.values()):
         raise InputError(nothing_to_compare(replicates))
-    start, notes = path.evaluation, Notes(too_short(short))
+    notes = Notes(too_short(short))
     replicates.budget.until = STEPS
     while len(path.steps) < max_steps and not _in_vain(path, notes) and _possible(path, notes):
         if path.steps or notes.explained:
-            keep(so_far(path, start, notes))
+            keep(so_far(path, notes))
     replicates.budget.until, stopped = FITS, len(path.steps) >= max_steps
     if path.steps:
         with or_as_before(path, "the fit of all numbers together"):
@@ -137,7 +138,7 @@ def _diagnosed(
             with or_as_before(path, "dropping the steps that are no longer needed"):
                 drop_needless(path)
         with or_as_before(path, "dropping the steps that explain too little of their own cells"):
-            drop_unexplaining(path, start, not notes.explained)
+            drop_unexplaining(path, path.start, not notes.explained)
         take_setup_again(path, notes)
         if path.approximate:
             replicates.budget.until = ERRORS
@@ -160,10 +161,11 @@ def _diagnosed(
             path.last_rung()
     with or_as_before(path, "the set-up by the last model"):
         _renew_setup(path, notes)
-    verdict = verdict_of(path, left_over(path, notes), notes)
+    in_sample = _compared(path)
+    verdict = _as_compared(verdict_of(path, left_over(path, notes), notes), notes, in_sample)
     if not path.steps:
         # what a nonlinearity may explain as well is not excused
-        path.evaluation = start if notes.bent else as_compared(replicates, start)
+        path.evaluation = path.start if notes.bent else as_compared(replicates, path.start)
         path.fit, path.values = None, {}
         path.ladder = path.ladder[:1] if verdict != "unexplained" else path.ladder
     rungs = [path.ladder[0], *([notes.placebo] if notes.placebo else []), *path.ladder[1:]]
@@ -187,17 +189,44 @@ def _diagnosed(
             limits = upper_limits.upper_limits(path.scan, path.evaluation, notes.tried, path.fit)
     replicates.budget.until = math.inf
     replicates.unstated = frozenset()  # measurement.yaml is as it was
-    in_sample: Comparison | None = None
-    with or_as_before(path, "the last comparison"):
-        replicates.say("the comparison of the model with its steps")
-        own = None if path.steps else start
-        in_sample = comparison_of(replicates, own) if own else comparison_with(replicates, path.sensor_values)
     last = LastLook(rungs=rungs, null_95=null_95, limits=limits, in_sample=in_sample)
-    found = answer(path, start, notes, verdict, last)
+    found = answer(path, notes, verdict, last)
     found.stopped, found.or_setup = stopped and verdict == "partly_explained", notes.rival is not None
     found.shared, found.bent = notes.shared, notes.bent
     found.faulty = notes.faulty if notes.explained else ""
     return found
+
+
+def _compared(path: ModelPath) -> Comparison | None:
+    """The comparison of the model with its steps, as `compare` compares the next sensor file; None where it cannot be.
+
+    Few replicates fail no model: where they do, it is simulated as often as by `compare`.
+    """
+    replicates = path.replicates
+    replicates.say("the comparison of the model with its steps")
+    unstated, replicates.unstated = replicates.unstated, frozenset()  # measurement.yaml is as it was
+    found: Comparison | None = None
+    try:
+        with or_as_before(path, "the last comparison"):
+            if not path.steps:
+                found = comparison_of(replicates, path.start)
+                if found.verdict == "fails" and not path.failed and has_few_replicates(path):
+                    look_closer(path)
+                    found = comparison_of(replicates, path.start)
+                return found
+            found = comparison_with(replicates, path.sensor_values)
+            if found.verdict == "fails" and found.replicates < REPLICATES and not path.failed:
+                found = comparison_with(replicates, path.sensor_values, REPLICATES)
+    finally:
+        replicates.unstated = unstated
+    return found
+
+
+def _as_compared(verdict: str, notes: Notes, in_sample: Comparison | None) -> str:
+    """The verdict, where `compare` finds the model wrong of which no check is left here: its file has other pixels."""
+    if in_sample is None or in_sample.verdict == "adequate" or notes.setup:
+        return verdict
+    return {"adequate": "unexplained", "explained": "partly_explained"}.get(verdict, verdict)
 
 
 def _measured(path: ModelPath, rungs: Sequence[Rung]) -> float:
@@ -252,7 +281,7 @@ def another_step(path: ModelPath, notes: Notes) -> bool:
     if waiting and plainly and added_from(path, notes, failed, waiting):
         return True
     if failed and not path.steps and min(b.p for b in failed) > CLEARLY and has_few_replicates(path):
-        path.evaluation = with_more_replicates(path)  # lest the scatter of few replicates decide
+        look_closer(path)  # lest the scatter of few replicates decide
         failed = path.failed
     if not failed:
         # no check fails: a score test along each signature
@@ -270,8 +299,7 @@ def another_step(path: ModelPath, notes: Notes) -> bool:
                 return True
             if path.evaluation is not closer:
                 return False
-        path.evaluation = before  # under this evaluation no check fails: nothing is left
-        return False
+        return path.evaluation is not before and bool(path.failed)  # by more replicates: the next turn has it
     asked = notes.explained or notes.taken_back is not None
     if not asked and scan.only_rates(path.evaluation) and explained_by_setup(path, notes):
         return is_freed(path, notes)
@@ -303,7 +331,7 @@ def stands_out(path: ModelPath, notes: Notes, largest_p: float) -> bool:
     if p >= min(_MAYBE * largest_p, 1.0):
         return False
     if has_few_replicates(path):
-        path.evaluation = with_more_replicates(path)
+        look_closer(path)
         p = p_now()
     if largest_p < p < _NEARLY * largest_p:
         path.replicates.say("more replicates of the candidates with the best scores")

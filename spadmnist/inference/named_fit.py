@@ -24,7 +24,7 @@ from .comparison import comparison_with
 from .coordinates import Coordinate, Key, point_of
 from .evidence import evidence_of
 from .exact_likelihood import MaximumLikelihood, NoLikelihood, likelihood_ratios, maximise, recordings
-from .findings import nuisances, remainder, traces
+from .findings import failing_of, nuisances, remainder, traces
 from .gauss_newton import JacobianBy, gauss_newton_step, profile_intervals
 from .intervals import fit_where_hit, scale_errors
 from .joint_fit import complete_fit, completed, edge_errors, fit_all, variances_by_pixels
@@ -122,7 +122,7 @@ def fit_named(
             nuisances=nuisances(replicates, path.evaluation),
             steps=path.steps,
             setup=[],
-            unexplained=remainder(replicates, path.evaluation, path.evaluation.residuals),
+            unexplained=remainder(replicates, path.evaluation, path.evaluation.residuals) or failing_of(in_sample),
             ladder=[rung.row for rung in path.ladder],
             advice=[],
             excluded=[],

@@ -25,6 +25,11 @@ def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str =
                 f"take {' and '.join(found.full)} with less light: nearly all of it is full, so that it tests hardly "
                 "anything."
             )
+        if found.faint:
+            return (
+                f"take {' and '.join(found.faint)} for longer: so few detections are expected that only their number "
+                "was compared."
+            )
         return (
             f"spadmnist diagnose {sensor} {measurement} gives a 95 % upper limit on each effect; a brighter, a darker "
             "or a longer capture tests the model further."

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 # of the range of the replicates' totals: how far beyond it they inform expectations. Farther off, where wrong models
 # had been called right, the expectation is that of the end; a rule of thumb
 _BEYOND = 1.0
-# factor on scores that are normal by themselves, least: replicates without a detection all have the same score, and one
-# detection would then be any number of sigma. A rule of thumb
-_LEAST_OF_SCORES = 0.5
+# factor on scores that are normal by themselves, least: where few detections cut their lower tail off, the replicates
+# scatter less, and the upper tail is as long as ever
+_LEAST_OF_SCORES = 1.0
 # safety factor on the variance of independent squares; the ratio to it from which on values are dependent
 _SURER, _JOINED = 1.1, 1.6
 _LEAST = 1e-300  # in place of a variance of 0: near the least number of a double
@@ -294,7 +294,7 @@ def tail_of(z: np.ndarray) -> float:
 
 
 def replicate_residuals(null: Null, made: CaptureReplicates, values: np.ndarray) -> np.ndarray:
-    """The residuals of the model's own replicates, (replicates, cells).
+    """The residuals of the model's own replicates, each as if it were new data, (replicates, cells).
 
     Args:
         null: their null distribution.
@@ -302,7 +302,8 @@ def replicate_residuals(null: Null, made: CaptureReplicates, values: np.ndarray)
         values: (replicates, cells) of the statistic.
     """
     expected, leverage = null.expected_all(made.totals)
-    return null.residuals(values, expected, -np.minimum(leverage, 0.9)[:, None])
+    hat, terms = np.minimum(leverage, 0.9)[:, None], len(null.coefficients)
+    return np.asarray(null.law.of_their_own(values, expected, null.spread, hat, terms) / null.factor)
 
 
 def scatter_of(null: Null, made: CaptureReplicates) -> np.ndarray:

@@ -17,8 +17,9 @@ from typing import Any
 from ..errors import SpadError
 from .budget import OutOfBudget
 from .capture_replicates import CannotSimulate
+from .checks import block_checks, failing
 from .coordinates import Key, Values, point_of
-from .evaluation import Evaluation, block_checks, evaluate, failing, log_likelihood_ratio, square
+from .evaluation import Evaluation, evaluate, log_likelihood_ratio, square
 from .gauss_newton import Fit, JacobianBy, gauss_newton_step
 from .models import Model
 from .replicates import FEW, Replicates

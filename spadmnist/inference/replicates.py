@@ -201,17 +201,21 @@ class Replicates:
         conditions = replace(recording.conditions, exposure=self.exposures[id])
         return replace(recording, capture=replace(recording.capture, conditions=conditions), _kept={})
 
-    def of_model(self, sensor: Sensor) -> Replicates:
-        """The measurement for another model, reduced as a comparison with that one reduces it."""
-        own = sensor.resolved()
+    def of_model(self, sensor: Sensor, number: int | None = None) -> Replicates:
+        """The measurement for another model, reduced as a comparison with that one reduces it.
+
+        Args:
+            number: of replicates of each capture; by default as many as here.
+        """
+        own, number = sensor.resolved(), number or self.number
         if (own.nominal_dead_time, own.tick) == (self.dead, self.start.tick):  # what the reduction takes of a sensor
             other = copy.copy(self)
-            other.start, other.simulations = own, 0
+            other.start, other.simulations, other.number = own, 0, number
             return other
         by = Execution(
             workers=self.workers, say=self.say, progress=self.progress, budget=self.budget, journal=self.journal
         )
-        return Replicates(sensor, self.measurement, self.seed, by, self.number, self.exposures, self.reduced)
+        return Replicates(sensor, self.measurement, self.seed, by, number, self.exposures, self.reduced)
 
     def candidates(self, sensor: Sensor) -> list[Candidate]:
         """Every candidate of a sensor that these captures can show."""

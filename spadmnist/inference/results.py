@@ -163,7 +163,8 @@ class Trace:
     """A check before and after, for a picture.
 
     Attributes:
-        size: of its clearest deviation from the first model, in words; where: that cell.
+        size: of its clearest deviation from the first model, in words; where: that cell; worst: its number. Of a check
+            of several cells together (a contrast), the cell that stands for them.
         deviation: the number of its group (`deviations`), 0 the clearest; first: it names the group.
         step: the number of the step that moves it most, None where none does.
         before, after: (cells,) the expectation of each model.
@@ -184,6 +185,7 @@ class Trace:
     deviation: int = 0
     first: bool = True
     step: int | None = None
+    worst: int | None = None
 
 
 @dataclass

@@ -15,9 +15,10 @@ from ..errors import UNABLE, SpadError, why
 from ..sensor import Sensor
 from .candidates import Candidate, has_random_pixels, templates, with_values
 from .capture_replicates import CannotSimulate
+from .checks import block_checks, failing
 from .coordinates import Key, is_edge
 from .earlier_trials import completed, still_valid
-from .evaluation import Evaluation, block_checks, failing, square
+from .evaluation import Evaluation, square
 from .levels import COST_OF_A_PARAMETER, LEAST_P, PROMISING
 from .map_trials import LEAST_P_OF_MAP, LEAST_P_WITH_ODD_PIXELS, map_trials_of
 from .models import Model

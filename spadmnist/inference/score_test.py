@@ -7,7 +7,7 @@ is corrected for the number of trials on the same replicates.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -263,7 +263,9 @@ def trials_corrected(replicate_p_values: np.ndarray, least: float) -> float:
     return float(-np.expm1(number * np.log1p(-min(least, 1 - 1e-12))))
 
 
-def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signature) -> ScoreTest:
+def score_test(
+    replicates: Replicates, evaluation: Evaluation, signature: Signature, fitted: np.ndarray | None = None
+) -> ScoreTest:
     """The score (matched-filter) test of a signature: the data's projection on it, in null standard deviations.
 
             z = sum_k v_k' P_k z_k / sd(sum_k v_k' P_k z*_k)
@@ -271,6 +273,10 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
     z_k, v_k: residuals and template of statistic k; z*: residuals of the replicates, cross-fitted in folds; P_k: the
     inverse of the shrunk covariance (Schaefer and Strimmer 2005) for 2 to 32 cells, otherwise the identity. Without a
     signature `size`, `data` and `replicates` are 0.
+
+    Args:
+        fitted: an orthonormal basis of what fitted coordinates move, (all cells, rank), in the order of the blocks. The
+            residuals have nothing along it, whatever the data were, and so have the weights P_k v_k then.
     """
     template = template_of(replicates, evaluation, signature)
     keys = [k for k, t in template.items() if t.any()]
@@ -278,24 +284,33 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
     most = float(many - 1)
     if not keys:
         return ScoreTest(size=0.0, data=0.0, replicates=np.zeros(many), spread=1.0, freedom=most)
+    moved: dict[Cell, np.ndarray] = {}
+    weights: list[dict[Cell, np.ndarray]] = [{} for _ in range(_FOLDS + 1)]  # by all replicates, by those of each fold
+    for key in keys:
+        null = evaluation.nulls.get(key)
+        moved[key] = template[key] if null is None else null.law.scores(template[key])
+        for some, weigh in zip(weights, _weightings(evaluation, key), strict=True):
+            some[key] = weigh(moved[key])
+    if fitted is not None:
+        weights = [_without(fitted, some, evaluation.residuals) for some in weights]
+        keys = list(evaluation.residuals)
     scores = np.zeros(many)
     size = data = norm = fourth = wild = 0.0
     for key in keys:
-        whole, *parts = _weightings(evaluation, key)
-        t, null = template[key], evaluation.nulls.get(key)
-        if null is not None:
-            t = null.law.scores(t)
-        w = whole(t)
-        for part, weigh in zip(_folds(many), parts, strict=True):
-            scores[part] += evaluation.replicate_residuals[key][part] @ weigh(t)
+        w, *parts = (some[key] for some in weights)
+        t = moved.get(key, np.zeros(len(w)))
+        for part, own in zip(_folds(many), parts, strict=True):
+            scores[part] += evaluation.replicate_residuals[key][part] @ own
         size, data = size + float(t @ w), data + float(evaluation.residuals[key] @ w)
         norm, fourth = norm + float(w @ w), fourth + float(np.sum(w**4))
         wild += float(np.sum(w[~_nearly_normal(replicates, evaluation, key)] ** 4))
+    if norm <= 0:
+        return ScoreTest(size=0.0, data=0.0, replicates=np.zeros(many), spread=1.0, freedom=most)
     norm = math.sqrt(norm)
     # many cells may scatter less together than independent ones; the score of a single one is not divided by a
     # scatter that rare counts make small
     cells = norm**4 / fourth
-    spread = max(float(scores.std()) / norm, 0.5 + 0.5 / math.sqrt(cells))
+    spread = max(float(scores.std(ddof=1)) / norm, 0.5 + 0.5 / math.sqrt(cells))
     # dependent cells may be far out together: the tails are those of few
     few = 2 * norm**4 / max(wild, 1e-300) / spread**2
     freedom = most if spread < _TOGETHER else min(max(few, _FEWEST), most)
@@ -306,6 +321,16 @@ def score_test(replicates: Replicates, evaluation: Evaluation, signature: Signat
         spread=spread,
         freedom=freedom,
     )
+
+
+def _without(
+    fitted: np.ndarray, weights: Mapping[Cell, np.ndarray], residuals: Mapping[Cell, np.ndarray]
+) -> dict[Cell, np.ndarray]:
+    """Weights without what lies along a basis of all cells, (cells,) by block."""
+    w = np.concatenate([weights.get(key, np.zeros(len(z))) for key, z in residuals.items()])
+    w = w - fitted @ (fitted.T @ w)
+    ends = np.cumsum([len(z) for z in residuals.values()])[:-1]
+    return dict(zip(residuals, np.split(w, ends), strict=True))
 
 
 def _nearly_normal(replicates: Replicates, evaluation: Evaluation, key: Cell) -> np.ndarray:

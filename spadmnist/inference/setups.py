@@ -30,6 +30,7 @@ from .replicates import TOTALS, Replicates, simulated
 from .results import plain
 from .scan import Scan
 from .signature import Signature, residuals_at, signature_of_totals, signatures
+from .totals_tests import along
 from .trial import Trial
 
 TIE = 6.0  # in chi square: explanations nearer than that are a tie, and all are named; a rule of thumb
@@ -47,6 +48,9 @@ _MISSING = 20.0
 # factor by which the end without detections must be longer than any other silence of the capture, and than the end of
 # the model's own recordings: bursts and gates end early, too. A rule of thumb; steady captures are far beyond it
 _LONGER = 2.0
+# standard deviations: the most that a capture deviates from what all others predict once the set-up explains it; a rule
+# of thumb
+_WITHIN = 4.0
 _MODELS = 4  # recordings of the model that are looked at, of captures whose end is empty
 
 
@@ -70,12 +74,14 @@ class SetupExplanation:
     Attributes:
         logs, errors: (factors,) estimates of their logarithms, standard deviations.
         left: (captures,) residuals of the totals.
+        largest: the largest deviation of a capture from what all others predict then, standard deviations.
     """
 
     factors: tuple[Factor, ...]
     logs: np.ndarray
     errors: np.ndarray
     left: np.ndarray
+    largest: float = 0.0
 
     @property
     def p(self) -> float:
@@ -91,14 +97,14 @@ class SetupExplanation:
     def without(self, factor: Factor) -> SetupExplanation:
         """The same residuals with the other factors alone."""
         kept = [k for k, one in enumerate(self.factors) if one != factor]
-        return SetupExplanation(
-            factors=tuple(self.factors[k] for k in kept), logs=self.logs[kept], errors=self.errors[kept], left=self.left
+        return replace(
+            self, factors=tuple(self.factors[k] for k in kept), logs=self.logs[kept], errors=self.errors[kept]
         )
 
     @property
     def explains(self) -> bool:
-        """Whether the totals pass with it: their p-value, and each residual within 4 sigma."""
-        return self.p > FALSE_ALARM and bool(np.all(np.abs(self.left) < 4))
+        """Whether the totals pass with it: their p-value, and each capture."""
+        return self.p > FALSE_ALARM and self.largest < _WITHIN
 
 
 def explanations(replicates: Replicates, evaluation: Evaluation) -> list[SetupExplanation]:
@@ -136,8 +142,16 @@ def explanations(replicates: Replicates, evaluation: Evaluation) -> list[SetupEx
             continue
         covariance = np.linalg.inv(design.T @ design)
         logs = covariance @ design.T @ z
+        left = z - design @ logs
+        scores = [score for score, _ in along(root, left, np.eye(len(ids)), np.zeros(len(ids)), np.ones(len(ids)))]
         found.append(
-            SetupExplanation(factors=factors, logs=logs, errors=np.sqrt(np.diag(covariance)), left=z - design @ logs)
+            SetupExplanation(
+                factors=factors,
+                logs=logs,
+                errors=np.sqrt(np.diag(covariance)),
+                left=left,
+                largest=float(np.max(np.abs(scores))),
+            )
         )
     return sorted((e for e in found if e.explains), key=lambda e: e.cost)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -102,21 +101,20 @@ def _times_at_limit(
 
     A strength of either sign has a limit on each side, and the farther one is taken.
     """
-    template = template_of(replicates, evaluation, one.signature.at(1.0))
-    free = share_beside(fit, evaluation, template)
-    if free < 1:  # the score of what is left beside the fitted numbers, of which the residuals may hold a little
-        test = replace(test, data=_score_beside(fit, evaluation, template) / test.spread)
+    fitted = None if fit is None or not fit.coordinates else _fitted(fit, evaluation)
+    if fitted is not None:
+        if share_beside(fit, evaluation, template_of(replicates, evaluation, one.signature.at(1.0))) < _LEAST_FREE:
+            return math.inf
+        test = score_test(replicates, evaluation, one.signature.at(1.0), fitted)
     coordinate = one.candidate.strengths[0]
     signed = coordinate.low < (coordinate.off or 0.0) < coordinate.high
     limits = []
     for sign in (1, -1) if signed else (1,):
-        times = linear_limit(test, sign, signed, free)
+        times = linear_limit(test, sign, signed)
         for _ in range(_LOOKS if one.signature.even is not None and math.isfinite(times) else 0):
             # iterated with the root of the factor, because a quadratic signature would oscillate
-            there = score_test(replicates, evaluation, one.signature.at(sign * times))
-            if free < 1:
-                there = replace(there, data=sign * test.data)
-            times *= math.sqrt(linear_limit(there, 1, signed, free))
+            there = score_test(replicates, evaluation, one.signature.at(sign * times), fitted)
+            times *= math.sqrt(linear_limit(there, 1, signed))
         limits.append(times)
     return max(limits)
 
@@ -131,16 +129,16 @@ def share_beside(fit: Fit | None, evaluation: Evaluation, template: Mapping[Cell
     """
     if fit is None or not fit.coordinates:
         return 1.0
-    t, rest = _beside(fit, evaluation, template)
+    keys = list(evaluation.residuals)
+    t = stacked({key: template.get(key, np.zeros(len(evaluation.residuals[key]))) for key in keys}, keys)
+    basis = _fitted(fit, evaluation)
+    rest = t - basis @ (basis.T @ t)
     return min(math.sqrt(float(rest @ rest) / float(t @ t)), 1.0) if t.any() else 1.0
 
 
-def _beside(fit: Fit, evaluation: Evaluation, template: Mapping[Cell, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """(a template, what no change of the fitted coordinates imitates of it), (cells,) of all blocks."""
-    keys = list(evaluation.residuals)
-    t = stacked({key: template.get(key, np.zeros(len(evaluation.residuals[key]))) for key in keys}, keys)
-    basis = evaluation.once(("columns of a fit", id(fit)), lambda: _basis_of(fit, evaluation))
-    return t, t - basis @ (basis.T @ t)
+def _fitted(fit: Fit, evaluation: Evaluation) -> np.ndarray:
+    """As `_basis_of`, made once."""
+    return evaluation.once(("columns of a fit", id(fit)), lambda: _basis_of(fit, evaluation))
 
 
 def _basis_of(fit: Fit, evaluation: Evaluation) -> np.ndarray:
@@ -151,27 +149,18 @@ def _basis_of(fit: Fit, evaluation: Evaluation) -> np.ndarray:
     return np.asarray(u[:, size > 1e-8 * max(float(size.max(initial=0.0)), 1e-300)])
 
 
-def _score_beside(fit: Fit | None, evaluation: Evaluation, template: Mapping[Cell, np.ndarray]) -> float:
-    """The data's score along what is left of a template, in standard deviations of independent cells."""
-    assert fit is not None
-    _, rest = _beside(fit, evaluation, template)
-    norm = math.sqrt(float(rest @ rest))
-    return float(stacked(evaluation.residuals, list(evaluation.residuals)) @ rest) / norm if norm > 0 else 0.0
-
-
-def linear_limit(test: ScoreTest, sign: int = 1, signed: bool = False, free: float = 1.0) -> float:
+def linear_limit(test: ScoreTest, sign: int = 1, signed: bool = False) -> float:
     """The factor on the strength at its upper limit, if the signature were linear.
 
     Args:
         test: of the signature.
         sign: of the strength, 1 or -1.
         signed: the limit is one of two, on both sides.
-        free: the share of the signature that no fitted coordinate imitates, see `share_beside`.
     """
-    if test.size <= 0 or free < _LEAST_FREE:
+    if test.size <= 0:
         return math.inf
     quantile = float(stats.t.isf(_BEYOND / 2 if signed else _BEYOND, test.freedom))
-    return (max(sign * test.data, 0.0) + quantile) / (test.size * free)
+    return (max(sign * test.data, 0.0) + quantile) / test.size
 
 
 def _at_limit(

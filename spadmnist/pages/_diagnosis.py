@@ -254,7 +254,7 @@ def _residuals(trace: Trace) -> tuple[np.ndarray, np.ndarray]:
 def _cells(trace: Trace) -> Cells:
     earlier, now = _residuals(trace)
     before, after, spread = (figures.finite(values) for values in (trace.before, trace.after, trace.spread))
-    worst = int(np.argmax(np.abs(earlier)))
+    worst = int(np.argmax(np.abs(earlier))) if trace.worst is None else trace.worst  # the sentence's own cell
     return Cells(trace.statistic, trace.summary, after, spread, now, worst, before, earlier)
 
 

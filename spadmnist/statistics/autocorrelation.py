@@ -63,7 +63,8 @@ class Autocorrelation(Statistic):
         lags = lags.ravel()
 
         def where(cell: int) -> str:
-            return f"the same pixel, {span(lags[cell], lags[cell] + width[cell])} later"
+            # detections in boxes that are so many apart: half a box less or more, most of them
+            return f"the same pixel, {span(lags[cell] - width[cell] / 2, lags[cell] + width[cell] / 2)} later"
 
         return _summary(recording, Surplus(pairs.ravel(), chance.ravel(), variance.ravel()), where, lags, "lag (s)")
 
