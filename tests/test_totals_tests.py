@@ -167,7 +167,7 @@ def test_light_that_is_off_in_all_captures_is_the_set_up() -> None:
     real = measured(dict.fromkeys(range(5), 0.035), [0.0] * 5, seed=3, frames=300)
     assert sp.compare(SENSOR, real, jobs=1).verdict == "fails"
     found = sp.diagnose(SENSOR, real, quick=True, jobs=1)
-    assert found.verdict == "setup" and {entry["quantity"] for entry in found.as_data()["setup"]} <= {
-        "light",
-        "exposure",
-    }
+    # few afterpulses would give these totals as well, which the answer says
+    assert found.verdict in ("setup", "confused")
+    light = {entry["capture"] for entry in found.as_data()["setup"] if entry["quantity"] == "light"}
+    assert light >= {f"c{k}" for k in range(5)}

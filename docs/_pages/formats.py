@@ -80,7 +80,8 @@ MEANINGS = {
     "`counts`, `intervals` or the statistic that informs it",
     "steps[].misfit": "misfit after this step",
     "steps[].significance": "improvement in standard deviations",
-    "steps[].material": "how far the step changes what is recorded, in words",
+    "steps[].material": "how far the step changes what is recorded, in words; with `in_sensor: false` where "
+    "the sensor file lacks the step, because the set-up explains the totals as well",
     "steps[].alternatives": "other changes that explain the same residuals, with their misfit",
     "setup": "errors of the set-up: light level, exposure, wavelength or a leak, with the factor and its interval",
     "unexplained": "significant residuals that no step explains: statistic, capture, place, `nearest` alternatives",

@@ -212,6 +212,7 @@ def rival_step(path: ModelPath, rival: Trial, faulty: str) -> Step:
         significance=math.sqrt(max(rival.fall, 0.0)),
         material="all rates alike; the sensor file does not have it",
         alternatives=[_outside(f"the set-up of {faulty}", left)],
+        in_sensor=False,
     )
 
 

@@ -95,6 +95,7 @@ class Step:
         material: the change of the mean rate, in words.
         alternatives: other changes that explain the same residuals. Each has `change`, `effect`, `parameter` and
             `misfit`; `effect` is None where no effect describes it, and `what` says what it is.
+        in_sensor: False where the next sensor does not have it, because the set-up explains the totals as well.
     """
 
     candidate: Candidate
@@ -117,6 +118,7 @@ class Step:
     map: PixelMap | None = field(default=None, repr=False)  # of a candidate per pixel, row, column or code
     hit: np.ndarray | None = field(default=None, repr=False)  # (pixels,) bool: which ones an effect has hit at random
     on_rough_fit: bool = False  # it was added to a model whose numbers were not all fitted together
+    in_sensor: bool = True
 
     @property
     def change(self) -> str:
@@ -155,7 +157,7 @@ class Step:
             "significance": plain(self.significance),
             "material": self.material,
             "alternatives": self.alternatives,
-        }
+        } | ({} if self.in_sensor else {"in_sensor": False})
 
 
 @dataclass(frozen=True)

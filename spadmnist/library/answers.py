@@ -234,7 +234,7 @@ class _Found:
 
     @property
     def model(self) -> Sensor:
-        """The `Sensor` with the fitted values of all steps; the one that was given where there are none."""
+        """The `Sensor` with the fitted values of all steps that are `in_sensor`; the given one where there are none."""
         return candidates.with_values(self.start, self.found.values)
 
     def as_data(self) -> dict[str, Any]:
