@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,10 +36,11 @@ from .grids import structured
 from .image_files import pixels_of
 from .photos import Making
 from .readout import READOUTS
+from .readout import Frames as PackedFrames
 from .sensor import Sensor
 
 _IN_MEMORY = 1 << 30  # bytes of fluxes up to which a set is read once and kept: MNIST at five levels
-_BUFFER = 4  # pieces whose images a stream shuffles together: shards of at most some 80 MB
+_BUFFER = 4  # pieces whose images a stream shuffles together: shards of at most some 80 MB, held as they are stored
 _PIECE = 256  # images of a piece where nothing is stored in shards
 _NO_LABEL = -1
 
@@ -172,7 +174,10 @@ def _with_channel(images: np.ndarray, part: Part) -> np.ndarray:
 
 
 def _frames(part: Part, readout: str, index: Any) -> torch.Tensor:
-    found = getattr(part, readout)[index]
+    return _of_frames(readout, getattr(part, readout)[index])
+
+
+def _of_frames(readout: str, found: np.ndarray) -> torch.Tensor:
     kind = {"qis": np.uint8, "str": np.float32, "counts": np.int32}[readout]
     return torch.from_numpy(np.ascontiguousarray(found.astype(kind, copy=False)))
 
@@ -349,8 +354,15 @@ class Stream(IterableDataset[Any]):
             images = _with_channel(np.concatenate([field[piece] for piece in ranges]), self.part)
             return torch.from_numpy(images).unbind().__getitem__
         assert self._method is not None
-        frames = [_frames(self.part, self._method, piece) for piece in ranges]
-        return torch.cat(frames).unbind().__getitem__
+        packed, readout = join([self.part.packed(self._method)[piece] for piece in ranges]), self._method
+        if isinstance(packed, PackedFrames):
+            packed = replace(packed, cause=None, parent=None)
+
+        def item(i: int) -> torch.Tensor:
+            one = packed[i : i + 1] if isinstance(packed, np.ndarray) else packed.images(i, i + 1)
+            return _of_frames(readout, self.part.unpacked(readout, one)[0])
+
+        return item
 
 
 def stream(
@@ -375,7 +387,7 @@ def stream(
         seed: of the order.
         rank, world: which of how many processes this is; each gets as many items as another, or one more.
         transform: called with the events of an image.
-        buffer: number of shards whose images are shuffled together, and held in memory.
+        buffer: number of shards whose images are shuffled together, and held in memory: frames as they are stored, packed.
 
     Returns:
         Stream: it iterates over (data, label).

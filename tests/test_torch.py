@@ -19,6 +19,7 @@ import spadmnist
 from spadmnist import config, factory, grids
 from spadmnist.errors import ConfigError, SpadError
 from spadmnist.events import Events
+from spadmnist.readout import Frames
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed")
 from torch.utils.data import DataLoader  # noqa: E402
@@ -349,6 +350,22 @@ def test_what_a_stream_gives(part: spadmnist.Part, kind: str) -> None:
     for (item, label), i in zip(st.stream(part, *what, seed=2), order, strict=True):
         right = expected(part, kind, i)
         assert np.array_equal(values(item), right.astype(values(item).dtype)) and label == labels[i]
+
+
+@pytest.mark.parametrize("readout", ["qis", "str"])
+def test_a_stream_unpacks_frames_one_by_one(
+    part: spadmnist.Part, readout: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four shards of frames, unpacked, take hundreds of times what they take as they are stored."""
+    sizes, name = [], {"qis": "unpacked", "str": "stamps"}[readout]
+    kept = getattr(Frames, name)
+
+    def counted(self: Frames, *kind: Any) -> np.ndarray:
+        sizes.append(len(self.bits) // self.pixels)
+        return kept(self, *kind)  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(Frames, name, counted)
+    assert len(list(itertools.islice(st.stream(part, "frames", readout), 12))) == 12 and sizes == [1] * 12
 
 
 @pytest.mark.parametrize("after", [0, 1, 10, 41, 69, 70])
