@@ -626,7 +626,7 @@ def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images
     needed = raw / 4 - present
     if free < needed:
         raise SpadError(
-            f"{root}: about {needed / 1e9:.1f} GB are still to be written, but only {free / 1e9:.1f} GB are free; "
+            f"{root}: about {disk.amount(needed)} are still to be written, but only {disk.amount(free)} are free; "
             "free some space, or choose another place with -o"
         )
 
