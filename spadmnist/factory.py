@@ -315,8 +315,7 @@ def tidy(root: Path, manifest: Mapping[str, Any]) -> None:
     """
     if (root / STATE).is_dir():
         with locked(root):
-            if begun := _begun(root, manifest):
-                raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, manifest, begun)}")
+            refuse_begun(root, manifest)
             clear_state(root)
 
 
@@ -325,6 +324,12 @@ def forget(root: Path) -> None:
     if (root / STATE).is_dir():
         with locked(root):
             clear_state(root)
+
+
+def refuse_begun(root: Path, manifest: Mapping[str, Any]) -> None:
+    """Raise SpadError where methods are being added to a finished dataset, or that was interrupted."""
+    if begun := _begun(root, manifest):
+        raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, manifest, begun)}")
 
 
 def _begun(root: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -433,9 +438,8 @@ def standing(experiment: Experiment, splits: Mapping[str, Images], root: Path) -
         experiment = written_as(experiment, kept) if kept else experiment
         wanted = identity(experiment, splits)
         _refuse_another(root, wanted, kept, finished)
-        if finished and (begun := _begun(root, kept)):
-            raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, kept, begun)}")
         if finished:
+            refuse_begun(root, kept)
             manifest_file.check_there(root, kept["files"])
     except SpadError as error:
         return f"generate would stop: {error}."
