@@ -387,7 +387,7 @@ def stream(
         seed: of the order.
         rank, world: which of how many processes this is; each gets as many items as another, or one more.
         transform: called with the events of an image.
-        buffer: number of shards whose images are shuffled together, and held in memory: frames as they are stored, packed.
+        buffer: number of shards whose images are shuffled together, and held in memory, frames as they are stored.
 
     Returns:
         Stream: it iterates over (data, label).
