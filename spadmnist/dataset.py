@@ -24,7 +24,7 @@ from .disk import Files
 from .errors import InputError, SpadError, UnknownName, did_you_mean
 from .events import Events
 from .experiment import Experiment, Level, level_of
-from .gather import gather, indices_of, join
+from .gather import BLOCK, gather, indices_of, join
 from .images import Images, cache_folder
 from .manifest_file import CONFIG, encoding_in, intact_manifest
 from .readout import Frames, Recorded
@@ -42,7 +42,13 @@ str_ = str  # within `Part` the name is a readout's
 
 
 class _Backend(Protocol):
-    """Where a part's data come from; ranges are of images."""
+    """Where a part's data come from; ranges are of images.
+
+    Attributes:
+        block: images that are read, or simulated, with each other anyway.
+    """
+
+    block: int
 
     def recorded(self, start: int, stop: int, what: str) -> Any: ...
 
@@ -68,10 +74,19 @@ class Field(Generic[T]):
     several images, (images, ...) of arrays. It has a length and can be iterated over.
     """
 
-    def __init__(self, length: int, get: Callable[[int, int], Any], one: Callable[[Any], Any]):
+    def __init__(
+        self,
+        length: int,
+        get: Callable[[int, int], Any],
+        one: Callable[[Any], Any],
+        block: int,
+        unpacked: Callable[[Any], Any] | None = None,
+    ):
         self._length = length
         self._get = get
         self._one = one
+        self._block = block
+        self._unpacked = unpacked or _same
 
     def __len__(self) -> int:
         return self._length
@@ -85,10 +100,10 @@ class Field(Generic[T]):
     def __getitem__(self, index: Any) -> Any:
         found = indices_of(index, self._length)
         if isinstance(found, int):
-            return self._one(self._get(found, found + 1))
+            return self._one(self._unpacked(self._get(found, found + 1)))
         if isinstance(found, range) and found.step == 1:
-            return self._get(found.start, max(found.start, found.stop))
-        return gather(self._get, np.asarray(found))
+            return self._unpacked(self._get(found.start, max(found.start, found.stop)))
+        return self._unpacked(gather(self._get, np.asarray(found), self._block))
 
     def __iter__(self) -> Iterator[T]:
         for i in range(self._length):
@@ -109,7 +124,7 @@ class Reconstruction(Field[np.ndarray]):
     def __init__(self, length: int, backend: _Backend, method: str):
         self._backend = backend
         self.method = method
-        super().__init__(length, partial(backend.reconstruction, method), _first)
+        super().__init__(length, partial(backend.reconstruction, method), _first, backend.block)
 
     @cached_property
     def normalisation(self) -> float | None:
@@ -122,7 +137,7 @@ class Reconstruction(Field[np.ndarray]):
     @property
     def normalised(self) -> Field[np.ndarray]:
         """The same divided by `normalisation`, 1; raw where the method is not normalised."""
-        return Field(self._length, self._divided, _first)
+        return Field(self._length, self._divided, _first, self._block)
 
     def _divided(self, start: int, stop: int) -> np.ndarray:
         raw = self._backend.reconstruction(self.method, start, stop)
@@ -231,7 +246,7 @@ class Part:
         self.readouts = tuple(readouts)
         self.shape = shape
         self.reconstruction = _ByMethod({name: Reconstruction(length, backend, name) for name in methods})
-        self.images = Field(length, backend.originals, _first)
+        self.images = Field(length, backend.originals, _first, backend.block)
 
     def __len__(self) -> int:
         return self._length
@@ -296,49 +311,53 @@ class Part:
     def frames(self) -> Field[Frames]:
         """QIS and STR as they are stored: bits packed, and the stamps of those that are set."""
         what: Any = "str" if "str" in self.readouts else "qis"
-        self._recorded(what)
-        return Field(self._length, partial(self._backend.recorded, what=what), _same)
+        return self.packed(what)
 
     @property
     def tr(self) -> Field[Events]:
         """TR: `Events` of an image's pixels, row by row."""
-        self._recorded("tr")
-        return Field(self._length, partial(self._backend.recorded, what="tr"), _same)
+        return self.packed("tr")
 
     @property
     def counts(self) -> Field[np.ndarray]:
         """The readout `counts`: (count frames, rows, columns) unsigned."""
-        self._recorded("counts")
-        return Field(self._length, self._tally, _first)
-
-    def _tally(self, start: int, stop: int) -> np.ndarray:
-        rows = self._backend.recorded(start, stop, "counts")
-        dense = rows.reshape(stop - start, *self.shape, rows.shape[-1])
-        # behind the image (and its channel): the frames, then rows and columns
-        return np.moveaxis(dense, -1, len(self.shape) - 1)
+        return self._of_frames("counts")
 
     @property
     def qis(self) -> Field[np.ndarray]:
         """QIS: (frames, rows, columns) uint8, 0 or 1."""
-        self._recorded("qis")
-        return Field(self._length, partial(self._frames, what="qis", unpack=Frames.unpacked), _first)
+        return self._of_frames("qis")
 
     @property
     def str(self) -> Field[np.ndarray]:
         """STR: (frames, rows, columns) float64, s since the start of the frame; the frame time without a detection."""
-        self._recorded("str")
-        return Field(self._length, partial(self._frames, what="str", unpack=Frames.stamps), _first)
+        return self._of_frames("str")
 
-    def _frames(self, start: int, stop: int, what: Any, unpack: Callable[[Frames], np.ndarray]) -> np.ndarray:
-        dense = unpack(self._backend.recorded(start, stop, what))
+    def packed(self, readout: Any) -> Field[Any]:
+        """A readout as it is stored: `Events` of TR, `Frames` of QIS and STR; of counts (images, pixels, count frames).
+
+        Raises SpadError where it was not recorded.
+        """
+        if readout not in self.readouts:
+            raise SpadError(f"{readout} was not recorded here; there are {', '.join(self.readouts)}")
+        return Field(self._length, partial(self._backend.recorded, what=readout), _same, self._backend.block)
+
+    def unpacked(self, readout: Any, packed: Any) -> np.ndarray:
+        """Frames of several images, (images, frames, rows, columns), of `packed`; of colour the channel leads them."""
+        if readout == "counts":
+            dense = packed.reshape(len(packed), *self.shape, packed.shape[-1])
+            # behind the image (and its channel): the frames, then rows and columns
+            return np.moveaxis(dense, -1, len(self.shape) - 1)
+        dense = packed.unpacked() if readout == "qis" else packed.stamps()
         n, frames, _ = dense.shape
         dense = dense.reshape(n, frames, *self.shape)
         # colour: the channel leads, then frames, rows, columns
         return np.moveaxis(dense, 2, 1) if len(self.shape) == 3 else dense
 
-    def _recorded(self, readout: Any) -> None:
-        if readout not in self.readouts:
-            raise SpadError(f"{readout} was not recorded here; there are {', '.join(self.readouts)}")
+    def _of_frames(self, readout: Any) -> Field[np.ndarray]:
+        """A readout of frames, unpacked after its images were gathered."""
+        packed = self.packed(readout)
+        return Field(self._length, packed._get, _first, packed._block, partial(self.unpacked, readout))
 
 
 class Dataset:
@@ -436,6 +455,8 @@ class Dataset:
 
 class _Stored:
     """A part of a finished dataset."""
+
+    block = BLOCK
 
     def __init__(
         self,
@@ -544,6 +565,7 @@ class _Simulated:
     def __init__(self, scene: _Scene, level: Level, split: str):
         self._scene = scene
         self._experiment = scene.experiment
+        self.block = scene.experiment.sensor.block
         self._level = level
         self._split = split
         self._last: tuple[tuple[int, int], Recorded] | None = None
@@ -617,12 +639,13 @@ class _Chosen:
 
     def __init__(self, inner: _Backend, indices: range | np.ndarray):
         self._inner, self._indices = inner, indices
+        self.block = inner.block
 
     def _read(self, get: Callable[[int, int], Any], start: int, stop: int) -> Any:
         chosen = self._indices[start:stop]
         if isinstance(chosen, range) and chosen.step == 1:
             return get(chosen.start, max(chosen.start, chosen.stop))
-        return gather(get, np.asarray(chosen, np.int64))
+        return gather(get, np.asarray(chosen, np.int64), self.block)
 
     def recorded(self, start: int, stop: int, what: str) -> Any:
         return self._read(partial(self._inner.recorded, what=what), start, stop)
@@ -659,6 +682,7 @@ class _Concatenated:
 
     def __init__(self, parts: Sequence[tuple[_Backend, int]]):
         self._parts = [backend for backend, _ in parts]
+        self.block = min(backend.block for backend in self._parts)
         self._starts = np.cumsum([0, *(length for _, length in parts)])
 
     def _pieces(self, start: int, stop: int) -> list[tuple[_Backend, int, int]]:

@@ -258,7 +258,7 @@ def writing(place: Path, size: int) -> Iterator[None]:
         else:
             advice = f"see to that (or choose another place with -o) and {again}"
         reason = error.strerror or str(error)
-        raise SpadError(f"{place}: cannot write up to {_amount(size)} here: {reason}; {advice}") from error
+        raise SpadError(f"{place}: cannot write up to {amount(size)} here: {reason}; {advice}") from error
 
 
 @contextlib.contextmanager
@@ -270,8 +270,12 @@ def writing_file(path: str | os.PathLike[str]) -> Iterator[None]:
         raise SpadError(f"{path}: cannot be written ({error.strerror or error}); name another file") from None
 
 
-def _amount(size: int) -> str:
-    return f"{size} bytes" if size < 10_000 else f"{size / 1e6:.3g} MB"
+def amount(size: float) -> str:
+    """So many bytes in words: `512 bytes`, `3.2 MB`, `15 GB`."""
+    if size < 10_000:
+        return f"{size:.0f} bytes"
+    unit, name = next(((unit, name) for unit, name in ((1e6, "MB"), (1e9, "GB")) if size < 999.5 * unit), (1e12, "TB"))
+    return f"{size / unit:.3g} {name}"
 
 
 @contextlib.contextmanager

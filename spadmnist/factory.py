@@ -68,6 +68,10 @@ _FEW = 2000  # images at all levels: fewer may well be made by this process alon
 # s of one core: less work is done by this process. Workers take 1 to 2 s of both cores to start: configs/quick.yaml, of
 # 0.6 s by this estimate, took 3.6 s without them and 6.3 s with two
 _ALONE = 1.0
+# s for which a part waits for who holds the dataset alone: another part that leaves does so for milliseconds, far less
+# than a run of the whole takes
+_LEAVING = 3.0
+_AGAIN = 0.02  # s between two tries
 _PER_EVENT_CAUSED = 90  # with the causes (measured: 70 to 105)
 
 
@@ -243,7 +247,7 @@ def note(root: Path, shard: Shard, files: Files, facts: Facts | None = None) -> 
 
 @contextlib.contextmanager
 def locked(root: Path, part: Part | None = None) -> Iterator[None]:
-    """Hold the dataset for writing: alone, or one part of it beside other parts.
+    """Hold the dataset for writing: alone, or one part of it beside other parts, of which a leaving one is waited for.
 
     The system frees the locks of a process that is killed. Raises SpadError where another run holds them.
     """
@@ -251,7 +255,7 @@ def locked(root: Path, part: Part | None = None) -> Iterator[None]:
         raise SpadError(f"--part {part}: this system has no lock that several parts can hold; leave it out")
     busy = f"{root}: another run is writing there; wait for it, or choose another folder with -o"
     with contextlib.ExitStack() as held:
-        whole = held.enter_context(_lock(root, "lock", busy, shared=part is not None))
+        whole = held.enter_context(_lock(root, "lock", busy, part is not None, _LEAVING if part else 0.0))
         if part:
             busy = f"{root}: another run is making part {part} of it; wait for that one"
             held.enter_context(_lock(root, f"part-{part.number}-of-{part.of}", busy))
@@ -265,18 +269,23 @@ def locked(root: Path, part: Part | None = None) -> Iterator[None]:
         os.rmdir(root)
 
 
-def _lock(root: Path, name: str, busy: str, shared: bool = False) -> system.Lock:
-    """A lock in the state of a dataset, which is made. Raises SpadError(busy) where another process holds it."""
-    state = root / STATE
+def _lock(root: Path, name: str, busy: str, shared: bool = False, wait: float = 0.0) -> system.Lock:
+    """A lock in the state of a dataset, which is made.
+
+    wait: s in which it is tried again. Raises SpadError(busy) where another process holds it still.
+    """
+    state, ends = root / STATE, time.monotonic() + wait
     while True:
         with _writable(root):
             state.mkdir(parents=True, exist_ok=True)
             try:
                 return system.Lock(state / name, shared)
             except system.Busy:
-                raise SpadError(busy) from None
+                if time.monotonic() >= ends:
+                    raise SpadError(busy) from None
             except FileNotFoundError:  # the run that ended meanwhile has removed the folder
                 continue
+        time.sleep(_AGAIN)
 
 
 def _leave(root: Path) -> None:
@@ -315,8 +324,7 @@ def tidy(root: Path, manifest: Mapping[str, Any]) -> None:
     """
     if (root / STATE).is_dir():
         with locked(root):
-            if begun := _begun(root, manifest):
-                raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, manifest, begun)}")
+            refuse_begun(root, manifest)
             clear_state(root)
 
 
@@ -325,6 +333,12 @@ def forget(root: Path) -> None:
     if (root / STATE).is_dir():
         with locked(root):
             clear_state(root)
+
+
+def refuse_begun(root: Path, manifest: Mapping[str, Any]) -> None:
+    """Raise SpadError where methods are being added to a finished dataset, or that was interrupted."""
+    if begun := _begun(root, manifest):
+        raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, manifest, begun)}")
 
 
 def _begun(root: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -433,9 +447,8 @@ def standing(experiment: Experiment, splits: Mapping[str, Images], root: Path) -
         experiment = written_as(experiment, kept) if kept else experiment
         wanted = identity(experiment, splits)
         _refuse_another(root, wanted, kept, finished)
-        if finished and (begun := _begun(root, kept)):
-            raise SpadError(f"{root}: reconstructions are being added to it; {_go_on(root, kept, begun)}")
         if finished:
+            refuse_begun(root, kept)
             manifest_file.check_there(root, kept["files"])
     except SpadError as error:
         return f"generate would stop: {error}."
@@ -626,7 +639,7 @@ def _check_space(root: Path, experiment: Experiment, splits: Mapping[str, Images
     needed = raw / 4 - present
     if free < needed:
         raise SpadError(
-            f"{root}: about {needed / 1e9:.1f} GB are still to be written, but only {free / 1e9:.1f} GB are free; "
+            f"{root}: about {disk.amount(needed)} are still to be written, but only {disk.amount(free)} are free; "
             "free some space, or choose another place with -o"
         )
 

@@ -11,9 +11,9 @@ import numpy as np
 from .events import Events
 from .readout import Frames
 
-# images between two that are wanted, up to which they are read in one range: a chunk holds 32, and what lies between
-# them is unpacked with it anyway
-_NEAR = 32
+# images of a block, of which all from the first to the last that is wanted are read in one range, and no more: a chunk
+# holds 32, and what lies between them is unpacked with it anyway
+BLOCK = 32
 
 _CHOSEN_BY = "images are chosen by a number, a slice, a list or array of numbers, or a mask"
 
@@ -55,16 +55,18 @@ def indices_of(index: Any, length: int) -> int | range | np.ndarray:
     return np.where(found < 0, found + length, found)
 
 
-def gather(get: Callable[[int, int], Any], indices: np.ndarray) -> Any:
+def gather(get: Callable[[int, int], Any], indices: np.ndarray, block: int = BLOCK) -> Any:
     """The images `indices`, in that order, of what `get(start, stop)` reads: arrays by image, `Events` or `Frames`.
 
-    Each image is read once, and neighbours in one range.
+    Each image is read once, and neighbours in one range. What nobody wants is read only where it lies between two that
+    are wanted in a block of so many images, and thrown away block by block.
     """
     if not len(indices):
         return get(0, 0)
     wanted, back = np.unique(indices, return_inverse=True)
     parts = []
-    for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > _NEAR) + 1):
+    apart = (np.diff(wanted) > 1) & (np.diff(wanted // block) > 0)
+    for run in np.split(wanted, np.flatnonzero(apart) + 1):
         first, stop = int(run[0]), int(run[-1]) + 1
         piece = get(first, stop)
         parts.append(piece if len(run) == stop - first else take(piece, run - first))

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from . import plugins, reconstruct, store
+from . import imported, plugins, reconstruct, store
 from .errors import SpadError
 from .experiment import Experiment
 from .images import Images
@@ -88,17 +88,25 @@ def refuse_other(root: Path, wanted: Mapping[str, Any], kept: Mapping[str, Any],
 
 
 def plugin_sources(experiment: Experiment) -> list[dict[str, str]]:
-    """The files that define the user's own effects and methods of an experiment, whole."""
+    """The files that define the user's own effects and methods of an experiment, whole, and those that they import.
+
+    Of what is installed the distribution and its version stand for its files.
+    """
     classes = [type(e) for e in experiment.sensor.effects] + [type(reconstruct.find(m)) for m in experiment.methods]
     used = {plugins.source_file(cls) for cls in classes}
-    return sorted(
-        (
-            {"file": path.name, "sha256": hashlib.sha256(text.encode()).hexdigest(), "source": text}
-            for path, text in plugins.loaded_files().items()
-            if str(path) in used
-        ),
-        key=lambda found: (found["file"], found["sha256"]),
-    )
+    found, own = [], set(imported.own_modules(cls.__module__ for cls in classes if plugins.is_installed(cls)))
+    for path, text in plugins.loaded_files().items():
+        if str(path) in used:
+            found.append(_source(path.name, hashlib.sha256(text.encode()).hexdigest(), text))
+            own |= set(plugins.imports_of(path))
+    found += [_source(one.file, one.sha256, one.text) for one in own]
+    for name, version in sorted({pair for cls in classes if (pair := plugins.distribution(cls))}):
+        found.append({"distribution": name, "version": version})
+    return sorted(found, key=lambda one: (one.get("file", ""), one.get("sha256", "")))
+
+
+def _source(file: str, sha256: str, text: str | None) -> dict[str, str]:
+    return {"file": file, "sha256": sha256, **({} if text is None else {"source": text})}
 
 
 def portable(experiment: Experiment) -> tuple[dict[str, Any], dict[str, bytes]]:

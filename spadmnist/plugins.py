@@ -18,6 +18,7 @@ import inspect
 import io
 import pkgutil
 import re
+import socket
 import sys
 import threading
 import time
@@ -29,7 +30,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from . import disk, leftovers, units
+from . import disk, imported, leftovers, units
 from .errors import EffectError, InputError, UnknownName, did_you_mean
 
 PLACES = ("spadmnist.effects", "spadmnist.reconstruct", "spadmnist.statistics")  # packages or modules
@@ -622,6 +623,8 @@ IMPORTED = time.time()  # s since the epoch: before any class of the user's coul
 _discovered = False
 _MODULE = "spadmnist_plugin_"  # how the modules of such files are named
 _loaded: dict[Path, str] = {}
+_imports: dict[Path, tuple[imported.Own, ...]] = {}  # of each of these files
+_packages: dict[str, tuple[str, str] | None] = {}  # of each plug-in package: its distribution and that one's version
 
 
 def discover() -> None:
@@ -639,6 +642,8 @@ def discover() -> None:
                 f"the installed plug-in {entry.name} ({entry.value}) cannot be loaded: "
                 f"{type(error).__name__}: {error}; mend it or uninstall it"
             ) from error
+        dist = entry.dist
+        _packages[entry.module.partition(".")[0]] = None if dist is None else (dist.name, dist.version)
     _discovered = True
 
 
@@ -691,6 +696,7 @@ def load_file(path: str | Path) -> None:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    before = set(sys.modules)
     try:
         loader.exec_module(module)
     except BaseException as error:
@@ -708,6 +714,8 @@ def load_file(path: str | Path) -> None:
             f"{path}: defines no effect, statistic or method, and nothing would come of it; `spadmnist effects --new "
             "NAME` begins an effect"
         )
+    ran = [name for name in sys.modules if name not in before and not is_module_of_file(name)]
+    _imports[file] = imported.own_modules([*ran, *imported.named(text)])
     _loaded[file] = text
 
 
@@ -736,17 +744,36 @@ def loaded_files() -> dict[Path, str]:
     return dict(_loaded)
 
 
+def imports_of(file: Path) -> tuple[imported.Own, ...]:
+    """The user's own modules that a plug-in file loaded by `load_file` imports, as they were then."""
+    return _imports[file]
+
+
+def distribution(cls: type) -> tuple[str, str] | None:
+    """(distribution, its version) that an installed plug-in came with; None of another one, or where none is known."""
+    return _packages.get(cls.__module__.partition(".")[0])
+
+
+def is_installed(cls: type) -> bool:
+    """Does a class come from a package that was found by its entry point?"""
+    return cls.__module__.partition(".")[0] in _packages
+
+
 @dataclass(frozen=True)
 class Carried:
-    """A plug-in file on its way to a worker, which may not have it."""
+    """A plug-in file on its way to a worker, which may not have it; imports: the (file, sha256) of `imports_of`."""
 
     path: str
     text: str
+    imports: tuple[tuple[str, str], ...] = ()
 
 
 def carried() -> tuple[Carried, ...]:
     """The plug-in files loaded by `load_file`, for workers."""
-    return tuple(Carried(str(path), text) for path, text in _loaded.items())
+    return tuple(
+        Carried(str(path), text, tuple((one.file, one.sha256) for one in _imports[path]))
+        for path, text in _loaded.items()
+    )
 
 
 _arriving = threading.Lock()  # two threads of one worker may be given the same
@@ -755,11 +782,12 @@ _arriving = threading.Lock()  # two threads of one worker may be given the same
 def load_carried(files: Iterable[Carried]) -> None:
     """Run plug-in files that another process has loaded, each once; what is not here is written into a folder.
 
-    Raises EffectError as `load_file`, where a file needs another one that is not here.
+    Raises EffectError as `load_file`, where a file needs another one that is not here, or is not the same here.
     """
     with _arriving:
         for file in files:
-            if file.text in _loaded.values():
+            if known := next((path for path, text in _loaded.items() if text == file.text), None):
+                _check_imports(file, known)
                 continue
             try:
                 here = Path(file.path).read_text(encoding="utf-8") == file.text
@@ -770,6 +798,17 @@ def load_carried(files: Iterable[Carried]) -> None:
                 path = leftovers.temporary("plugin") / path.name
                 path.write_text(file.text, encoding="utf-8")
             load_file(path)
+            _check_imports(file, path.resolve())
+
+
+def _check_imports(file: Carried, here: Path) -> None:
+    """Raise EffectError where a plug-in file imports others here than where it comes from."""
+    found = {(one.file, one.sha256) for one in _imports[here]}
+    if other := sorted(name for name, _ in found ^ set(file.imports)):
+        raise EffectError(
+            f"{file.path}: the plug-in imports {other[0]}, which is not the same in a worker on {socket.gethostname()} "
+            "as where the run began; leave it as it is while a run goes on, and have the same there"
+        )
 
 
 def blame(cls: type[Plugin], error: BaseException) -> EffectError:

@@ -6,6 +6,8 @@ Linux and macOS have all of it. Where a part is absent (Windows), its stand-in i
 from __future__ import annotations
 
 import contextlib
+import functools
+import math
 import os
 import signal
 import stat
@@ -219,9 +221,52 @@ def read_at(handle: int, offset: int, length: int) -> bytes:
 # --- limits -------------------------------------------------------------------------------------------------------
 
 
+_GROUPS = Path("/sys/fs/cgroup")  # where Linux shows its control groups, and which of them this process is in
+_OWN_GROUPS = Path("/proc/self/cgroup")
+
+
+@functools.lru_cache(maxsize=4)
+def _granted(groups: Path, own: Path) -> tuple[float, float]:
+    """(processors, bytes of memory) that the control groups of this process grant it; inf where they do not say.
+
+    A container, or a job of a batch system, is such a group. Each group on the way from this process's own to the first
+    one can limit it, in version 2 as in version 1.
+    """
+    processors, memory = [math.inf], [math.inf]
+    for line in _words(own).splitlines():
+        if line.count(":") < 2:
+            continue
+        _, kinds, path = line.split(":", 2)  # of version 2 no kinds
+        parts = [part for part in path.split("/") if part not in ("", ".", "..")]
+        roots = [groups / name for name in (kinds, *kinds.split(","))] if kinds else [groups, groups / "unified"]
+        for folder in (root.joinpath(*parts[:n]) for root in roots for n in range(len(parts) + 1)):
+            shares = (
+                _words(folder / "cpu.max").split(),
+                [_words(folder / f"cpu.cfs_{x}_us") for x in ("quota", "period")],
+            )
+            for quota, period in (map(_number, share) for share in shares if len(share) == 2):
+                processors.append(quota / period if period < math.inf else math.inf)
+            memory += [_number(_words(folder / name)) for name in ("memory.max", "memory.limit_in_bytes")]
+    return min(processors), min(memory)
+
+
+def _words(file: Path) -> str:
+    try:
+        return file.read_text()
+    except (OSError, ValueError):  # there is no such file, or it is not this user's to read
+        return ""
+
+
+def _number(text: str) -> float:
+    """A positive whole number; inf of anything else: `max` and -1 mean no limit."""
+    text = text.strip()
+    return int(text) if text.isascii() and text.isdecimal() and int(text) else math.inf
+
+
 def processors() -> int:
-    """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """How many processors this process may use, 1 or more; a part of one that a container has counts as one."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return math.ceil(min(there, _granted(_GROUPS, _OWN_GROUPS)[0]))
 
 
 def address_space() -> int | None:
@@ -233,7 +278,7 @@ def address_space() -> int | None:
 
 
 def memory() -> int:
-    """Bytes that this machine, or the limit of this process, has for all of it."""
+    """Bytes that this machine, its container, or the limit of this process, has for all of it."""
     if hasattr(os, "sysconf"):
         whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     else:
@@ -241,7 +286,8 @@ def memory() -> int:
 
         whole = int(psutil.virtual_memory().total)
     limit = address_space()
-    return whole if limit is None else min(whole, limit)
+    whole = whole if limit is None else min(whole, limit)
+    return int(min(whole, _granted(_GROUPS, _OWN_GROUPS)[1]))
 
 
 # --- processes ----------------------------------------------------------------------------------------------------

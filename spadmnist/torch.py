@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,10 +36,11 @@ from .grids import structured
 from .image_files import pixels_of
 from .photos import Making
 from .readout import READOUTS
+from .readout import Frames as PackedFrames
 from .sensor import Sensor
 
 _IN_MEMORY = 1 << 30  # bytes of fluxes up to which a set is read once and kept: MNIST at five levels
-_BUFFER = 4  # pieces whose images a stream shuffles together: shards of at most some 80 MB
+_BUFFER = 4  # pieces whose images a stream shuffles together: shards of at most some 80 MB, held as they are stored
 _PIECE = 256  # images of a piece where nothing is stored in shards
 _NO_LABEL = -1
 
@@ -172,7 +174,10 @@ def _with_channel(images: np.ndarray, part: Part) -> np.ndarray:
 
 
 def _frames(part: Part, readout: str, index: Any) -> torch.Tensor:
-    found = getattr(part, readout)[index]
+    return _of_frames(readout, getattr(part, readout)[index])
+
+
+def _of_frames(readout: str, found: np.ndarray) -> torch.Tensor:
     kind = {"qis": np.uint8, "str": np.float32, "counts": np.int32}[readout]
     return torch.from_numpy(np.ascontiguousarray(found.astype(kind, copy=False)))
 
@@ -198,7 +203,9 @@ class Stream(IterableDataset[Any]):
         self.transform, self.buffer = transform, buffer
         self._method = method
         self._epoch = _Shared()
-        self._done, self._goes_on = 0, False
+        self._by_workers = _Shared()  # 1 where workers make the pass that was begun last
+        self._given = _Given()
+        self._done, self._at = 0, 0  # items of the pass that this process began last, and its epoch
         self._cuts = part.cuts(_PIECE)
         if kind == "events":
             _ = part.tr
@@ -216,6 +223,7 @@ class Stream(IterableDataset[Any]):
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, which gives another order from the next pass on. It reaches workers that are kept."""
         self._epoch.value = epoch
+        self._by_workers.value = 0
 
     def __len__(self) -> int:
         """Items of this rank, over all its workers."""
@@ -243,11 +251,23 @@ class Stream(IterableDataset[Any]):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """How far this process has come: kept and given back by `load_state_dict`, the same stream goes on there."""
-        return {**self._made_of(), "epoch": self._epoch.value, "done": self._done}
+        """How far this process has come: kept and given back by `load_state_dict`, the same stream goes on there.
+
+        Each worker has a state of its own, which only that worker can tell. Raises SpadError outside of them.
+        """
+        if get_worker_info() is None and self._by_workers.value:
+            raise SpadError(
+                "the stream is iterated by workers, each of which has a state of its own; take it there, as "
+                "torchdata's StatefulDataLoader does, or call set_epoch first, for the state of an epoch's beginning"
+            )
+        epoch = self._epoch.value
+        return {**self._made_of(), "epoch": epoch, "done": self._done if self._at == epoch else 0}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where `state` was taken. Raises SpadError where it is of another stream, worker or rank."""
+        """Go on where `state` was taken, in the next pass if that is of the same epoch.
+
+        Raises SpadError where it is of another stream, worker or rank.
+        """
         own = self._made_of()
         if missing := [name for name in (*own, "epoch", "done") if name not in state]:
             raise SpadError(f"the state says no {missing[0]}; give one that state_dict of this version returned")
@@ -257,16 +277,37 @@ class Stream(IterableDataset[Any]):
                     f"the state is of {name} {state[name]}, but this stream has {value}; make the stream as the one "
                     "that the state is of, or begin anew"
                 )
-        self._epoch.value, self._done, self._goes_on = int(state["epoch"]), int(state["done"]), True
+        epoch, done = int(state["epoch"]), int(state["done"])
+        self._epoch.value, self._done, self._at, self._by_workers.value = epoch, done, epoch, 0
+        if get_worker_info() is not None:
+            self._given = _Given()  # what a worker is given is for that one alone
+        self._given.put(epoch, done, own["consumer"], own["consumers"])
 
-    def _pieces(self) -> list[tuple[int, int]]:
-        """(start, stop) of images of this consumer, in the order of this epoch: whole shards, cut at its two ends.
+    def _skipped(self, epoch: int) -> int:
+        """How many items the pass that begins leaves out: those that the state it goes on from had given.
+
+        Raises SpadError where those were shared out among other workers.
+        """
+        at, done, *of = self._given.numbers()
+        here = self._share()
+        if done and at == epoch and tuple(of) != here:
+            raise SpadError(
+                f"the state that was loaded is of consumer {of[0]} of {of[1]}, but this is consumer {here[0]} of "
+                f"{here[1]} (ranks and their workers are counted from 0); iterate with as many workers as when it was "
+                "taken, let torchdata's StatefulDataLoader keep a state for each worker, or call set_epoch to begin "
+                "another epoch"
+            )
+        self._given.put()  # the pass after this one is whole
+        return done if at == epoch else 0
+
+    def _pieces(self, epoch: int) -> list[tuple[int, int]]:
+        """(start, stop) of images of this consumer, in the order of an epoch: whole shards, cut at its two ends.
 
         The shards follow one another in an order of chance, and each consumer has an equal share of their images.
         """
         consumer, consumers = self._share()
         cuts = self._cuts
-        order = self._random("order").permutation(len(cuts) - 1)
+        order = self._random(epoch, "order").permutation(len(cuts) - 1)
         total = len(self.part)
         low, high = consumer * total // consumers, (consumer + 1) * total // consumers
         found, at = [], 0
@@ -278,22 +319,24 @@ class Stream(IterableDataset[Any]):
             at += stop - start
         return found
 
-    def _random(self, *names: Any) -> np.random.Generator:
-        text = "/".join(map(str, (self.seed, self._epoch.value, *names)))
+    def _random(self, epoch: int, *names: Any) -> np.random.Generator:
+        text = "/".join(map(str, (self.seed, epoch, *names)))
         words = np.frombuffer(hashlib.sha256(text.encode()).digest(), "<u4")
         return np.random.Generator(np.random.Philox(np.random.SeedSequence(words.tolist())))
 
     def __iter__(self) -> Iterator[tuple[Any, int]]:
-        skipped = self._done if self._goes_on else 0
-        self._done, self._goes_on = skipped, False
-        pieces = self._pieces()
+        epoch = self._epoch.value  # of the whole pass, whatever is set meanwhile
+        skipped = self._skipped(epoch)
+        self._by_workers.value = int(get_worker_info() is not None)
+        self._done, self._at = skipped, epoch
+        pieces = self._pieces(epoch)
         for k in range(0, len(pieces), self.buffer):
             group = pieces[k : k + self.buffer]
             numbers = np.concatenate([np.arange(*piece) for piece in group])
             if skipped >= len(numbers):
                 skipped -= len(numbers)
                 continue
-            order = self._random("buffer", self._share()[0], k).permutation(len(numbers))[skipped:]
+            order = self._random(epoch, "buffer", self._share()[0], k).permutation(len(numbers))[skipped:]
             skipped = 0
             items, labels = self._loaded(group), _labels(self.part, numbers)
             for i in order.tolist():
@@ -311,8 +354,15 @@ class Stream(IterableDataset[Any]):
             images = _with_channel(np.concatenate([field[piece] for piece in ranges]), self.part)
             return torch.from_numpy(images).unbind().__getitem__
         assert self._method is not None
-        frames = [_frames(self.part, self._method, piece) for piece in ranges]
-        return torch.cat(frames).unbind().__getitem__
+        packed, readout = join([self.part.packed(self._method)[piece] for piece in ranges]), self._method
+        if isinstance(packed, PackedFrames):
+            packed = replace(packed, cause=None, parent=None)
+
+        def item(i: int) -> torch.Tensor:
+            one = packed[i : i + 1] if isinstance(packed, np.ndarray) else packed.images(i, i + 1)
+            return _of_frames(readout, self.part.unpacked(readout, one)[0])
+
+        return item
 
 
 def stream(
@@ -337,7 +387,7 @@ def stream(
         seed: of the order.
         rank, world: which of how many processes this is; each gets as many items as another, or one more.
         transform: called with the events of an image.
-        buffer: number of shards whose images are shuffled together, and held in memory.
+        buffer: number of shards whose images are shuffled together, and held in memory, frames as they are stored.
 
     Returns:
         Stream: it iterates over (data, label).
@@ -363,6 +413,21 @@ class _Shared:
         if value < 0:
             raise SpadError(f"epoch: {value} is not possible; epochs count from 0")
         self._cell[0] = value
+
+
+class _Given:
+    """A state with which no pass has begun yet, as workers see it, too: those that are kept, forked or spawned."""
+
+    def __init__(self) -> None:
+        self._cells = torch.zeros(4, dtype=torch.int64).share_memory_()
+
+    def put(self, epoch: int = 0, done: int = 0, consumer: int = 0, consumers: int = 0) -> None:
+        """Give another one; by default none. done: items that it has had; consumer, consumers: of `Stream._share`."""
+        self._cells[:] = torch.tensor([epoch, done, consumer, consumers])
+
+    def numbers(self) -> list[int]:
+        """[epoch, done, consumer, consumers]; done is 0 where there is none."""
+        return [int(x) for x in self._cells]
 
 
 # --- batches of events --------------------------------------------------------------------------------------------

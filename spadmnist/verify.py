@@ -81,8 +81,18 @@ def verify(root: Path | Source, progress: Progress = Progress()) -> Damage:  # n
     if not changed and not missing and not _adds_up(root, manifest):
         changed.append(MANIFEST)
     read += len(manifest_file.canonical(manifest))
-    extra = sorted(found - set(listed) - {MANIFEST})
+    # what a run has left in the state is no file of the dataset
+    extra = sorted(name for name in found - set(listed) - {MANIFEST} if not name.startswith(f"{STATE}/"))
     return Damage(tuple(changed), tuple(sorted(missing)), tuple(extra), len(present) + 1, read)
+
+
+def refuse_begun(root: Path | Source) -> None:
+    """Raise SpadError where methods are being added to a dataset that was finished: its files are of two datasets."""
+    if not isinstance(root, Path) or not (root / STATE).is_dir():
+        return
+    manifest = _manifest(root)
+    if manifest is not None:
+        factory.refuse_begun(root, manifest)
 
 
 def _adds_up(root: Path | Source, manifest: Mapping[str, Any]) -> bool:
@@ -345,8 +355,6 @@ def _set_aside(root: Path, extra: Sequence[str]) -> list[str]:
     aside = root.resolve().parent / f"{root.resolve().name}.extra"
     did = []
     for name in extra:
-        if name.startswith(f"{STATE}/"):
-            continue  # left by a run that was interrupted; goes with the state
         if not os.path.lexists(root / name):
             continue  # it went with the folder that it lay in
         target = aside / name
@@ -364,4 +372,4 @@ def _set_aside(root: Path, extra: Sequence[str]) -> list[str]:
     return did
 
 
-__all__ = ["Damage", "repair", "verify"]
+__all__ = ["Damage", "refuse_begun", "repair", "verify"]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from spadmnist import disk, system
+from spadmnist import config, disk, document, factory, system
 from spadmnist.errors import SpadError
 
 PIECE = bytes(1 << 20)
@@ -50,3 +51,25 @@ def test_an_early_synchronisation_that_fails_ends_the_write(tmp_path: Path, monk
     with pytest.raises(SpadError, match="Input/output error"), disk.writing(tmp_path / "new", 1):
         disk.put_tree(tmp_path / "new", {"shard": iter([PIECE] * PIECES)})
     assert len(calls) > 1
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [(0, "0 bytes"), (9999, "9999 bytes"), (10_000, "0.01 MB"), (3.21e6, "3.21 MB"), (999.4e6, "999 MB"),
+     (999.6e6, "1 GB"), (123.4e9, "123 GB"), (5e12, "5 TB")],
+)  # fmt: skip
+def test_amounts_are_said_in_a_unit_of_their_size(size: float, words: str) -> None:
+    assert disk.amount(size) == words
+
+
+def test_a_nearly_full_disk_is_told_in_amounts_that_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = """
+seed: 1
+scene: {images: {source: digits, train: 200, test: 2, rows: 8, columns: 8}, lux: [20 mlux]}
+recording: {exposure: 800 us, frames: 80, frame_time: 10 us, readouts: [qis]}
+sensor: {layout: {rows: 8, columns: 8, pixel_area: 25 um^2}, effects: {detection: {pdp: 0.5}}}
+"""
+    experiment = config.build(document.parse(text, "lab.yaml"), tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: shutil._ntuple_diskusage(10**9, 10**9, 2000))  # type: ignore[attr-defined]
+    with pytest.raises(SpadError, match=r"about 0\.[0-9]+ MB are still to be written, but only 2000 bytes are free"):
+        factory._check_space(tmp_path, experiment, experiment.load_images(), 0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import random
 import signal
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -62,6 +64,23 @@ def test_what_was_changed_between_the_parts_and_the_end_is_made_again(whole: tup
     shard.write_bytes(content)
     assert make(whole[0], root).made == 1
     assert_same(root, tree(whole[1]))
+
+
+def test_a_part_waits_for_one_that_leaves(tmp_path: Path) -> None:
+    """The last part holds the dataset alone for a moment, and finds out that it is not the last."""
+    root, held = tmp_path / "out", threading.Event()
+
+    def leave() -> None:
+        with factory.locked(root):
+            held.set()
+            time.sleep(0.2)
+
+    leaving = threading.Thread(target=leave)
+    leaving.start()
+    assert held.wait(10)
+    with factory.locked(root, Part(1, 2)):
+        leaving.join()
+        assert root.is_dir()
 
 
 def test_parts_that_hold_their_locks(whole: tuple[Path, Path], tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ MODULES = {str(p.relative_to(PACKAGE)): p for p in sorted(PACKAGE.rglob("*.py"))
 
 # a module imports from layers below its own, and within its own only along an arrow
 LAYERS = [
-    {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "system"},
+    {"errors", "foreign", "heap", "interrupts", "units", "streams", "light", "system", "imported"},
     {"compiled", "import_options", "leftovers"},
     {"bit_planes", "disk", "estimators", "kernels", "large", "packing", "sources", "workers"},
     {"archive"},

@@ -18,6 +18,7 @@ from spadmnist.errors import SpadError
 from spadmnist.events import Events
 from spadmnist.gather import gather, indices_of
 from spadmnist.readout import Frames
+from spadmnist.sensor import Sensor
 
 CONFIG = """
 seed: 3
@@ -237,6 +238,46 @@ def test_gathering_reads_each_image_once(numbers: list[int]) -> None:
     assert isinstance(indices, np.ndarray)
     assert list(gather(get, indices)) == [n % 300 * 10 for n in numbers]
     assert len(read) == len(set(read)) and len(read) <= 32 * max(1, len(set(numbers)))
+
+
+def test_gathering_reads_little_that_nobody_wants() -> None:
+    """Of a strided choice it was all that lies between: 32 times what was asked for, in memory at once."""
+    ranges: list[tuple[int, int]] = []
+
+    def get(start: int, stop: int) -> np.ndarray:
+        ranges.append((start, stop))
+        return np.arange(start, stop)
+
+    for step, block, wanted in ((32, 32, 47), (2, 32, 47), (2, 1, 750), (1, 32, 1), (1, 1, 1)):
+        ranges.clear()
+        assert np.array_equal(gather(get, np.arange(0, 1500, step), block), np.arange(0, 1500, step))
+        assert len(ranges) == wanted
+        assert step == 1 or max(stop - start for start, stop in ranges) <= block
+    assert sum(stop - start for start, stop in ranges) == 1500
+
+
+def test_what_is_chosen_is_unpacked_and_simulated_alone(part: spadmnist.Part, monkeypatch: pytest.MonkeyPatch) -> None:
+    unpacked: list[int] = []
+    simulated: list[int] = []
+    for name in ("unpacked", "stamps"):
+        kept = getattr(Frames, name)
+
+        def counted(self: Frames, *kind: Any, kept: Any = kept) -> np.ndarray:
+            unpacked.append(len(self.bits) // self.pixels)
+            return kept(self, *kind)  # type: ignore[no-any-return]
+
+        monkeypatch.setattr(Frames, name, counted)
+    expose = Sensor.expose
+
+    def seen(self: Sensor, photons: np.ndarray, *more: Any, **named: Any) -> Any:
+        simulated.append(len(photons))
+        return expose(self, photons, *more, **named)
+
+    monkeypatch.setattr(Sensor, "expose", seen)
+    for read in (lambda: part.qis[::8], lambda: part.str[[3, 60, 30, 3]], lambda: part[::8].qis[:]):
+        chosen = read()
+        assert unpacked == [len(chosen)] and unpacked.pop()
+    assert sum(simulated) == (0 if part.stored else 9 + 3 + 9)
 
 
 def test_a_name_that_a_dataset_has_not_is_a_sentence() -> None:

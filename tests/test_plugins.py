@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from spadmnist import plugins
+from spadmnist import config, document, identity, plugins
 from spadmnist.effects import STAGES, Effect
 from spadmnist.errors import EffectError, InputError
 from spadmnist.events import Layout
@@ -43,7 +43,7 @@ def forgotten() -> Iterator[None]:
     """What a test loads is gone after it."""
     plugins.discover()
     effects, methods = dict(Effect.registry.classes), dict(Method.registry.classes)
-    loaded, modules = dict(plugins._loaded), set(sys.modules)
+    loaded, packages, modules = dict(plugins._loaded), dict(plugins._packages), set(sys.modules)
     yield
     Effect.registry.classes.clear()
     Effect.registry.classes.update(effects)
@@ -51,8 +51,10 @@ def forgotten() -> Iterator[None]:
     Method.registry.classes.update(methods)
     plugins._loaded.clear()
     plugins._loaded.update(loaded)
+    plugins._packages.clear()
+    plugins._packages.update(packages)
     for name in set(sys.modules) - modules:
-        if name.startswith("spadmnist_plugin_"):
+        if name.startswith(("spadmnist_plugin_", "optics")):
             del sys.modules[name]
 
 
@@ -529,3 +531,89 @@ def test_kinds_are_told_by_units_where_nothing_is_declared() -> None:
     assert {key: kinds[key] for key in told} == told
     with pytest.raises(TypeError, match="'line' is none of the kinds smooth, time, edge"):
         plugins.parameter(1.0, "Hz", "", kind="line")
+
+
+# --- what a plug-in imports -----------------------------------------------------------------------------------------
+
+CONFIG = """\
+seed: 1
+scene: {images: {source: digits, train: 2, test: 2, rows: 8, columns: 8}, lux: [20 mlux]}
+recording: {exposure: 80 us, readouts: [tr]}
+reconstruct: [counts]
+sensor:
+  rules: device
+  layout: {rows: 8, columns: 8, pixel_area: 25 um^2}
+  effects: {detection: {pdp: 0.5}, half_light: {share: 0.5}}
+"""
+HERE = "import sys\nsys.path.insert(0, {!r})\n"
+
+
+def afresh(path: Path) -> list[dict[str, str]]:
+    """What a dataset says of its plug-ins where another process makes it."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "optics"]:
+        del sys.modules[name]
+    plugins._loaded.clear()
+    Effect.registry.classes.pop("half_light", None)
+    importlib.invalidate_caches()
+    plugins.load_file(path)
+    return identity.plugin_sources(config.build(document.parse(CONFIG, "lab.yaml"), path.parent))
+
+
+@pytest.mark.parametrize(
+    ("imports", "file"),
+    [  # where it stands in the plug-in, or how it is said, does not matter
+        ("from optics import FACTOR", "optics/__init__.py"),
+        ("import optics.glass", "optics/glass.py"),
+        ("from optics import glass", "optics/glass.py"),
+        ("import importlib\nimportlib.import_module('optics.glass')", "optics/glass.py"),
+        ("def later():\n    from optics import glass", "optics/glass.py"),
+        ("import optics", "optics/glass.py"),  # which the package imports itself
+    ],
+)
+def test_what_a_plugin_imports_is_told_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, imports: str, file: str
+) -> None:
+    """A dataset of another module beside the plug-in is another dataset; a plug-in that imports none is as before."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "optics").mkdir()
+    (tmp_path / "optics" / "__init__.py").write_text("from . import glass\nFACTOR = 1.0\n")
+    (tmp_path / "optics" / "glass.py").write_text("INDEX = 1.5\n")
+    plain = afresh(written(tmp_path, HALF))
+    assert [(one["file"], one["source"]) for one in plain] == [("mine.py", HALF)]
+    path = written(tmp_path, HERE.format(str(tmp_path)) + imports + "\n" + HALF)
+    before = afresh(path)
+    assert {one["file"] for one in before} == {"mine.py", "optics/__init__.py", "optics/glass.py"}
+    assert before == afresh(path)
+    text = (tmp_path / file).read_text() + "MORE = 2\n"
+    (tmp_path / file).write_text(text)
+    (changed,) = [one for one in afresh(path) if one not in before]
+    assert (changed["file"], changed["source"]) == (file, text)
+
+
+def test_a_worker_imports_what_the_run_imports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "optics.py").write_text("FACTOR = 1.0\n")
+    path = written(tmp_path, HERE.format(str(tmp_path)) + "from optics import FACTOR\n" + HALF)
+    afresh(path)
+    sent = plugins.carried()
+    plugins.load_carried(sent)
+    (tmp_path / "optics.py").write_text("FACTOR = 2.0\n")
+    afresh(path)
+    with pytest.raises(EffectError, match=r"mine\.py: the plug-in imports optics\.py, which is not the same"):
+        plugins.load_carried(sent)
+
+
+def test_of_what_is_installed_the_distribution_is_told(
+    tmp_path: Path, installed: list[importlib.metadata.EntryPoint], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(tmp_path, HALF, "shop_effects.py")
+    point = entry("shop_effects")
+    vars(point)["dist"] = type("Dist", (), {"name": "shop", "version": "2.1"})()
+    installed.append(point)
+    plugins.discover()
+    told = identity.plugin_sources(config.build(document.parse(CONFIG, "lab.yaml"), tmp_path))
+    assert {"distribution": "shop", "version": "2.1"} in told
+    # it lies where nothing is installed, as of `pip install -e`: its version may stay while it changes
+    assert [one["source"] for one in told if "file" in one] == [HALF]

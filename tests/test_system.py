@@ -189,6 +189,43 @@ def test_the_lock_is_of_what_lies_there_now(tmp_path: Path, monkeypatch: pytest.
         assert removed and place.exists()
 
 
+@pytest.mark.parametrize(
+    ("own", "files", "processors", "memory"),
+    [
+        ("0::/", {"memory.max": "max", "cpu.max": "max 100000"}, 8, 1 << 60),
+        ("0::/", {"memory.max": "1000000", "cpu.max": "150000 100000"}, 2, 1000000),
+        # the group of a job in that of a user: each of them limits it
+        ("0::/user/job", {"user/memory.max": "2000000", "user/job/memory.max": "max", "user/job/cpu.max": "5 10"},
+         1, 2000000),
+        ("0::/user/job", {"user/memory.max": "2000000", "user/job/memory.max": "3000000", "user/cpu.max": "30 10"},
+         3, 2000000),
+        ("0::/user/job", {"other/memory.max": "5", "other/cpu.max": "5 10"}, 8, 1 << 60),
+        # version 1, inside a container, which sees its own group as the first one
+        ("5:memory:/docker/ab\n4:cpu,cpuacct:/docker/ab\n",
+         {"memory/memory.limit_in_bytes": "4000000", "cpu,cpuacct/cpu.cfs_quota_us": "300000",
+          "cpu,cpuacct/cpu.cfs_period_us": "100000"}, 3, 4000000),
+        ("5:memory:/a\n4:cpu:/a\n",
+         {"memory/a/memory.limit_in_bytes": "9223372036854771712", "cpu/a/cpu.cfs_quota_us": "-1",
+          "cpu/a/cpu.cfs_period_us": "100000"}, 8, 1 << 60),
+        ("nonsense\n", {"memory.max": "5"}, 8, 1 << 60),
+    ],
+)  # fmt: skip
+def test_a_container_limits_processors_and_memory(
+    own: str, files: dict[str, str], processors: int, memory: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, text in files.items():
+        file = tmp_path / "groups" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text + "\n")
+    (tmp_path / "own").write_text(own)
+    monkeypatch.setattr(system, "_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(system, "_OWN_GROUPS", tmp_path / "own")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(8)), raising=False)
+    monkeypatch.setattr(os, "sysconf", lambda name: 1 << 30, raising=False)
+    monkeypatch.setattr(system, "address_space", lambda: None)
+    assert (system.processors(), system.memory()) == (processors, memory)
+
+
 def test_one_module_alone_has_what_differs_between_systems() -> None:
     package = Path(spadmnist.__file__).parent
     names = (

@@ -19,6 +19,7 @@ import spadmnist
 from spadmnist import config, factory, grids
 from spadmnist.errors import ConfigError, SpadError
 from spadmnist.events import Events
+from spadmnist.readout import Frames
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed")
 from torch.utils.data import DataLoader  # noqa: E402
@@ -351,6 +352,22 @@ def test_what_a_stream_gives(part: spadmnist.Part, kind: str) -> None:
         assert np.array_equal(values(item), right.astype(values(item).dtype)) and label == labels[i]
 
 
+@pytest.mark.parametrize("readout", ["qis", "str"])
+def test_a_stream_unpacks_frames_one_by_one(
+    part: spadmnist.Part, readout: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four shards of frames, unpacked, take hundreds of times what they take as they are stored."""
+    sizes, name = [], {"qis": "unpacked", "str": "stamps"}[readout]
+    kept = getattr(Frames, name)
+
+    def counted(self: Frames, *kind: Any) -> np.ndarray:
+        sizes.append(len(self.bits) // self.pixels)
+        return kept(self, *kind)  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(Frames, name, counted)
+    assert len(list(itertools.islice(st.stream(part, "frames", readout), 12))) == 12 and sizes == [1] * 12
+
+
 @pytest.mark.parametrize("after", [0, 1, 10, 41, 69, 70])
 def test_a_stream_goes_on_where_it_stopped(part: spadmnist.Part, after: int) -> None:
     whole = numbers(part, st.stream(part, "fluxes", seed=5))
@@ -385,6 +402,89 @@ def test_a_state_is_of_one_stream(part: spadmnist.Part) -> None:
     del state["buffer"]
     with pytest.raises(SpadError, match="the state says no buffer"):
         made.load_state_dict(state)
+
+
+def begun(stream: Any, items: int) -> dict[str, Any]:
+    """The state of a stream, of which that many were taken."""
+    for _ in itertools.islice(stream, items):
+        pass
+    return dict(stream.state_dict())
+
+
+@pytest.mark.parametrize("persistent", [False, True])
+def test_a_state_goes_on_with_the_workers_that_it_is_of(part: spadmnist.Part, persistent: bool) -> None:
+    """Of others it would leave images out and give some twice, in each epoch: it is refused."""
+    whole = numbers(part, st.stream(part, "fluxes", seed=5))
+    stream = st.stream(part, "fluxes", seed=5)
+    state, known = begun(stream, 12), marks(part)
+    two = DataLoader(stream, batch_size=None, num_workers=2, persistent_workers=persistent)
+    stream.load_state_dict(state)
+    with pytest.raises(SpadError, match="state that was loaded is of consumer 0 of 1, but this is consumer"):
+        list(two)
+    two = DataLoader(stream, batch_size=None, num_workers=2, persistent_workers=persistent)
+    for epoch in (1, 0):  # what the state says of another epoch is nothing to these
+        stream.set_epoch(epoch)
+        assert sorted(known[item[0].numpy().tobytes()] for item, _ in two) == list(range(N))
+    stream.load_state_dict(begun(st.stream(part, "fluxes", seed=5), 0))  # of the beginning: any number of workers
+    assert len(list(two)) == N
+    one = DataLoader(stream, batch_size=None, num_workers=1, persistent_workers=persistent)
+    for left in (whole, whole[12:], whole):  # the pass before, the one that goes on, and the one after it
+        if left is not whole:
+            stream.load_state_dict(state)
+        assert [known[item[0].numpy().tobytes()] for item, _ in one] == left
+
+
+def test_a_state_is_of_its_epoch_alone(part: spadmnist.Part) -> None:
+    stream = st.stream(part, "fluxes", seed=5)
+    stream.load_state_dict(begun(stream, 12))
+    stream.set_epoch(1)
+    assert sorted(numbers(part, stream)) == list(range(N))
+    stream.set_epoch(2)
+    assert stream.state_dict()["epoch"] == 2 and stream.state_dict()["done"] == 0
+    whole = numbers(part, stream)
+    half = iter(stream)
+    known = marks(part)
+    first = [known[item[0].numpy().tobytes()] for item, _ in itertools.islice(half, 12)]
+    stream.set_epoch(3)  # from the next pass on
+    assert first + [known[item[0].numpy().tobytes()] for item, _ in half] == whole
+
+
+def test_outside_of_its_workers_a_stream_has_no_state(part: spadmnist.Part) -> None:
+    stream = st.stream(part, "fluxes", seed=5)
+    for _ in itertools.islice(DataLoader(stream, batch_size=4, num_workers=2), 3):
+        pass
+    with pytest.raises(SpadError, match="iterated by workers, each of which has a state of its own; take it there"):
+        stream.state_dict()
+    stream.set_epoch(1)
+    assert stream.state_dict()["done"] == 0
+    assert begun(stream, 5)["done"] == 5
+
+
+class Telling(torch.utils.data.IterableDataset[Any]):
+    """Does in each worker what torchdata's StatefulDataLoader does there: it gives a state, and takes one."""
+
+    def __init__(self, stream: Any, states: dict[int, Any]):
+        self.stream, self.states = stream, states
+
+    def __iter__(self) -> Any:
+        worker = torch.utils.data.get_worker_info().id
+        if worker in self.states:
+            self.stream.load_state_dict(self.states[worker])
+        for item, _ in self.stream:
+            yield worker, item, self.stream.state_dict()
+
+
+def test_each_worker_goes_on_from_its_own_state(part: spadmnist.Part) -> None:
+    known, states, first, rest = marks(part), {}, [], []
+    made = st.stream(part, "fluxes", seed=5)
+    loader = DataLoader(Telling(made, {}), batch_size=None, num_workers=2)
+    for worker, item, state in itertools.islice(loader, 25):
+        first.append(known[item[0].numpy().tobytes()])
+        states[worker] = state
+    made = st.stream(part, "fluxes", seed=5)
+    for _, item, _ in DataLoader(Telling(made, states), batch_size=None, num_workers=2):
+        rest.append(known[item[0].numpy().tobytes()])
+    assert len(first) == 25 and sorted(first + rest) == list(range(N))
 
 
 def test_a_stream_of_several_levels_and_of_a_config(dataset: spadmnist.Dataset, folder: Path) -> None:

@@ -26,6 +26,7 @@ from test_factory import (
 
 import spadmnist
 from spadmnist import factory, manifest_file, verify
+from spadmnist.cli import cli
 from spadmnist.errors import SpadError
 from spadmnist.factory import Progress
 from spadmnist.store import encoding
@@ -556,6 +557,17 @@ def test_repair_after_an_interrupted_reconstruct(few: dict[int, Path], tmp_path:
     damage = verify.verify(root)
     assert damage
     verify.repair(root, damage, 1)
+    assert_same(root, tree(few[2]))
+
+
+def test_verify_of_an_interrupted_reconstruct_says_how_it_goes_on(few: dict[int, Path], tmp_path: Path) -> None:
+    """Nothing there is damaged. What is in its state is nobody's loss either."""
+    root = interrupted_reconstruct(few[2], tmp_path / "out", 1)
+    with pytest.raises(SpadError, match=r"are being added to it; `spadmnist reconstruct \S+ .*` goes on where"):
+        cli(["verify", str(root)], standalone_mode=False)
+    assert all(not name.startswith(".spadmnist") for name in verify.verify(root).extra)
+    cli(["verify", str(root), "--repair"], standalone_mode=False)
+    cli(["verify", str(root)], standalone_mode=False)
     assert_same(root, tree(few[2]))
 
 

@@ -353,6 +353,8 @@ def verify(
             damage = library.verify(root, progress)
         _say_damage(str(root), damage, damage, [], "bring or make it again", as_json)
         return
+    if not repair:
+        library.refuse_begun(root)
     with options.workers_of(jobs, cluster, no_shared) as workers, terminal.progress() as progress:
         damage = library.verify(root, progress)
         left, did = damage, []

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import functools
 import os
-import site
 import sys
-import sysconfig
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from .. import plugins
+from .. import imported, plugins
 
 
 def digested(own: Collection[type]) -> list[bytes] | None:
@@ -49,15 +47,8 @@ def _modules(packages: Collection[str]) -> Iterator[tuple[str, str]]:
         file, package = getattr(module, "__dict__", {}).get("__file__"), name.partition(".")[0]
         if not isinstance(file, str) or name == "__main__" or package == plugins.__package__:
             continue
-        if package in packages or not (file.startswith(_installed()) or plugins.is_module_of_file(name)):
+        if package in packages or not (file.startswith(imported.installed()) or plugins.is_module_of_file(name)):
             yield name, file
-
-
-@functools.cache
-def _installed() -> tuple[str, ...]:
-    """The folders of the standard library and of installed packages."""
-    found = {sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")}
-    return tuple(os.path.join(folder, "") for folder in (found | {*site.getsitepackages(), site.getusersitepackages()}))
 
 
 @functools.lru_cache(maxsize=1024)
