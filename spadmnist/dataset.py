@@ -326,8 +326,12 @@ class Part:
     @property
     def str(self) -> Field[np.ndarray]:
         """STR: (frames, rows, columns) float64, s since the start of the frame; the frame time without a detection."""
+        return self._stamps(np.float64)
+
+    def _stamps(self, kind: type[np.floating]) -> Field[np.ndarray]:
+        """STR as floats of a kind."""
         self._recorded("str")
-        return Field(self._length, partial(self._frames, what="str", unpack=Frames.stamps), _first)
+        return Field(self._length, partial(self._frames, what="str", unpack=partial(Frames.stamps, kind=kind)), _first)
 
     def _frames(self, start: int, stop: int, what: Any, unpack: Callable[[Frames], np.ndarray]) -> np.ndarray:
         dense = unpack(self._backend.recorded(start, stop, what))
