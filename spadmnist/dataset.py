@@ -742,7 +742,7 @@ def concatenate(parts: Sequence[Part]) -> Part:
 def open(
     path: str | Path,
     images_dir: str | Path | None = None,
-    plugin: Sequence[str | Path] = (),
+    plugin: Sequence[str | Path] | None = (),
     cache: str | Path | None = None,
 ) -> Dataset:
     """Open a dataset: its folder, a zip of it, or its address (`https://`, `http://`, `s3://`: extra `remote`).
@@ -751,8 +751,7 @@ def open(
     for; plugin: files with effects that a config names; cache: folder for what was read from an address, default
     `$SPADMNIST_CACHE` or the system's place for it. Raises InputError or ConfigError with a sentence.
     """
-    for file in plugin:
-        plugins.load_file(file)
+    plugins.load_files(plugin, "plugin")
     root = at(path, cache)
     if isinstance(root, Source):
         return stored(root)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import units
+from ..document import path_of
 from ..errors import InputError, did_you_mean
 from ..events import Layout
 from ..foreign import html_table, quoted
@@ -69,6 +70,7 @@ class Measurement:
         """Write it as `measurement.yaml` and a file for each capture; the folder. Raises SpadError as `write` does."""
         from .writer import write
 
+        folder = path_of(folder, "the folder to write to")
         data = (c if c.mean is not None else self.recording(c.id) for c in self.captures)
         return write(folder, self.name, self.layout, data, self.captures)
 
