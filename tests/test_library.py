@@ -652,6 +652,37 @@ def test_times_of_any_kind_are_compared(kind: str) -> None:
     assert sp.compare(sensor(), data, jobs=1).verdict == "adequate"
 
 
+@pytest.mark.parametrize("clocked", [True, False])
+def test_times_without_ticks_are_compared_alike_before_and_after_they_are_saved(tmp_path: Path, clocked: bool) -> None:
+    """Of a file they are in its ticks, which are not those of a converter."""
+    dark = sp.Capture("dark", "tr", dark=True, exposure=5e-3)
+    rng = np.random.default_rng(4)
+    times, pixels = np.sort(rng.uniform(0, 5e-3, 60)), rng.integers(0, 4, 60)
+    times[:30] = np.rint(times[:30] / 1e-9) * 1e-9  # as a converter of 1 ns gives them, in s
+    model = sensor(2, 2) if clocked else sensor(2, 2).without("tdc")
+    lab = sp.Measurement.from_arrays(model.layout, {dark: (times, pixels)})
+    again = sp.open_measurement(lab.save(tmp_path / "lab"))
+    held, read = (one.recording("dark", model).events for one in (lab, again))
+    assert held is not None and read is not None
+    assert held.tick == read.tick == (1e-9 if clocked else 1e-12) and np.array_equal(held.times, read.times)
+    first, second = (sp.compare(model, one, jobs=1).as_data() for one in (lab, again))
+    assert first["checks"] and first == second
+    twice = sp.open_measurement(again.save(tmp_path / "again"))
+    assert (tmp_path / "again/dark.h5").read_bytes() == (tmp_path / "lab/dark.h5").read_bytes()
+    assert twice.recording("dark").untimed and again["dark"].events.tick == 1e-12
+
+
+def test_a_damaged_mark_of_times_without_ticks_is_a_sentence(tmp_path: Path) -> None:
+    import h5py
+
+    dark = sp.Capture("dark", "tr", dark=True, exposure=5e-3)
+    folder = sp.Measurement.from_arrays(sensor().layout, {dark: ([1e-3], [2])}).save(tmp_path / "lab")
+    with h5py.File(folder / "dark.h5", "r+") as file:
+        file.attrs["untimed"] = 7
+    with pytest.raises(InputError, match="the attribute untimed is '7'; it is 0 or 1"):
+        sp.open_measurement(folder)
+
+
 def test_what_is_masked_is_no_data() -> None:
     capture, times, pixels = stamps_of(sensor())
     hidden = np.ma.masked_array(times, mask=np.arange(times.size) < 40)
