@@ -3,6 +3,7 @@
 | modality | data sets | attributes |
 | --- | --- | --- |
 | tr | `time` (ticks since the start of the exposure), `pixel` (row-major), one entry per detection | `tick` (s) |
+| | | `untimed`: 1 where the times had no ticks, and these are the file's alone |
 | qis | `frames` (M, rows, ceil(columns / 8)) uint8, packed along columns, high bit first | `width` (columns) |
 | | or (M, rows, columns) of 0 and 1 | |
 | str | `frames` (M, rows, columns) ticks since the start of the frame; none = ceil(frame time / tick) | `tick` (s) |
@@ -36,8 +37,9 @@ from .events import Events, Layout
 from .foreign import visible
 from .kernels import jit
 from .readout import counts_type, no_detection, stamps_for, unsigned_for
-from .recording import Capture, Recording
+from .recording import FINEST, Capture, Recording, whole_ticks
 
+_UNTIMED = "untimed"  # attribute of a file of TR: 1 where the ticks are the file's alone
 OWNER = "capture_id"  # attribute of a file in a measurement that was written here: which capture it is
 # bytes of the stamps of a capture, of 4 bytes each or 8, which lie in memory; the program and all that it needs besides
 # to read, look at and write them take up to 0.5 GB (measured), and so a capture costs at most 1 GB
@@ -65,6 +67,7 @@ class _Found:
     capture: Capture  # with what only the file knows
     tick: float | None = None
     packed: bool = False
+    untimed: bool = False
 
 
 # --- the file -----------------------------------------------------------------------------------------------------
@@ -324,7 +327,10 @@ def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Foun
     check_number(path, len(time), stamps_type(path, capture.conditions.exposure, tick))
     check_stored(time, "time", path)
     check_stored(pixel, "pixel", path)
-    return _Found(capture, tick)
+    untimed = attribute((file,), _UNTIMED, path)
+    if untimed not in (None, 0, 1):
+        raise InputError(f"{path}: the attribute {_UNTIMED} is {str(untimed)[:40]!r}; it is 0 or 1")
+    return _Found(capture, tick, untimed=bool(untimed))
 
 
 def stamps_type(path: Path, exposure: float, tick: float) -> np.dtype[Any]:
@@ -432,7 +438,8 @@ def read(path: Path, capture: Capture, layout: Layout, dead_time: float) -> tupl
         found = _found(file, capture, layout.shape, path)
         if capture.modality == "tr":
             events, notes = _events(file, found, layout.pixels, path)
-            return Recording(found.capture, layout, events, None, found.tick, dead_time), notes
+            read = Recording(found.capture, layout, events, None, found.tick, dead_time, untimed=found.untimed)
+            return read, notes
     frames = StoredFrames(path, found, layout.shape)
     return Recording(found.capture, layout, None, frames, found.tick, dead_time), []
 
@@ -641,8 +648,6 @@ class StoredFrames:
 
 # --- writing ------------------------------------------------------------------------------------------------------
 
-_FINEST = 1e-12  # s: the tick of stamps that a sensor without a converter gives
-
 
 def write(recording: Recording, file: IO[bytes], attributes: Mapping[str, Any] | None = None) -> None:
     """Write a recording as an HDF5 file into a new, empty file, piece by piece: the same bytes for the same recording.
@@ -740,10 +745,12 @@ class _Sink:
 def _put_events(file: Any, recording: Recording, events: Events, alive: Callable[[], None]) -> None:
     pixels, count, tick = recording.pixels, len(events), events.tick
     kind = np.dtype(np.uint8) if events.ticks is None else events.ticks.dtype
+    untimed = recording.untimed or events.ticks is None
     if events.ticks is None or tick is None:
-        tick = _FINEST
+        tick = FINEST
         kind = np.dtype(unsigned_for(recording.conditions.exposure / tick, "time stamps"))
-    _put(file, {"tick": tick, "tick_units": "s"})
+    _put(file, {"tick": tick, "tick_units": "s"} | ({_UNTIMED: np.uint8(1)} if untimed else {}))
+    last = no_detection(recording.conditions.exposure, tick) - 1
     about = "time of each detection since the start of the exposure"
     time = _create(file, "time", (count,), kind, min(count, 1 << 16), units.show(tick, "s", 12), about)
     numbers = np.uint16 if pixels <= 1 << 16 else np.uint32
@@ -752,7 +759,7 @@ def _put_events(file: Any, recording: Recording, events: Events, alive: Callable
     for start in range(0, count, _PIECE):
         alive()
         some = slice(start, min(start + _PIECE, count))
-        stamps = events.times[some] / tick if events.ticks is None else events.ticks[some]
+        stamps = whole_ticks(events.times[some] / tick, last) if events.ticks is None else events.ticks[some]
         time[some] = stamps.astype(kind)
         pixel[some] = events.rows_of(some.start, some.stop)
 

@@ -321,17 +321,17 @@ class Part:
     @property
     def counts(self) -> Field[np.ndarray]:
         """The readout `counts`: (count frames, rows, columns) unsigned."""
-        return self._of_frames("counts")
+        return self.of_frames("counts")
 
     @property
     def qis(self) -> Field[np.ndarray]:
         """QIS: (frames, rows, columns) uint8, 0 or 1."""
-        return self._of_frames("qis")
+        return self.of_frames("qis")
 
     @property
     def str(self) -> Field[np.ndarray]:
         """STR: (frames, rows, columns) float64, s since the start of the frame; the frame time without a detection."""
-        return self._of_frames("str")
+        return self.of_frames("str")
 
     def packed(self, readout: Any) -> Field[Any]:
         """A readout as it is stored: `Events` of TR, `Frames` of QIS and STR; of counts (images, pixels, count frames).
@@ -342,22 +342,25 @@ class Part:
             raise SpadError(f"{readout} was not recorded here; there are {', '.join(self.readouts)}")
         return Field(self._length, partial(self._backend.recorded, what=readout), _same, self._backend.block)
 
-    def unpacked(self, readout: Any, packed: Any) -> np.ndarray:
-        """Frames of several images, (images, frames, rows, columns), of `packed`; of colour the channel leads them."""
+    def unpacked(self, readout: Any, packed: Any, kind: type[np.floating] = np.float64) -> np.ndarray:
+        """Frames of several images, (images, frames, rows, columns), of `packed`; of colour the channel leads them.
+
+        kind: of stamps (s), which are floats.
+        """
         if readout == "counts":
             dense = packed.reshape(len(packed), *self.shape, packed.shape[-1])
             # behind the image (and its channel): the frames, then rows and columns
             return np.moveaxis(dense, -1, len(self.shape) - 1)
-        dense = packed.unpacked() if readout == "qis" else packed.stamps()
+        dense = packed.unpacked() if readout == "qis" else packed.stamps(kind)
         n, frames, _ = dense.shape
         dense = dense.reshape(n, frames, *self.shape)
         # colour: the channel leads, then frames, rows, columns
         return np.moveaxis(dense, 2, 1) if len(self.shape) == 3 else dense
 
-    def _of_frames(self, readout: Any) -> Field[np.ndarray]:
-        """A readout of frames, unpacked after its images were gathered."""
+    def of_frames(self, readout: Any, kind: type[np.floating] = np.float64) -> Field[np.ndarray]:
+        """A readout of frames, unpacked after its images were gathered. kind: of stamps (s)."""
         packed = self.packed(readout)
-        return Field(self._length, packed._get, _first, packed._block, partial(self.unpacked, readout))
+        return Field(self._length, packed._get, _first, packed._block, partial(self.unpacked, readout, kind=kind))
 
 
 class Dataset:
@@ -762,7 +765,7 @@ def concatenate(parts: Sequence[Part]) -> Part:
 def open(
     path: str | Path,
     images_dir: str | Path | None = None,
-    plugin: Sequence[str | Path] = (),
+    plugin: Sequence[str | Path] | None = (),
     cache: str | Path | None = None,
 ) -> Dataset:
     """Open a dataset: its folder, a zip of it, or its address (`https://`, `http://`, `s3://`: extra `remote`).
@@ -771,8 +774,7 @@ def open(
     for; plugin: files with effects that a config names; cache: folder for what was read from an address, default
     `$SPADMNIST_CACHE` or the system's place for it. Raises InputError or ConfigError with a sentence.
     """
-    for file in plugin:
-        plugins.load_file(file)
+    plugins.load_files(plugin, "plugin")
     root = at(path, cache)
     if isinstance(root, Source):
         return stored(root)

@@ -16,6 +16,7 @@ import importlib.metadata
 import importlib.util
 import inspect
 import io
+import os
 import pkgutil
 import re
 import socket
@@ -23,7 +24,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -667,6 +668,21 @@ class _Read(importlib.abc.SourceLoader):
         if path != self.file:
             raise FileNotFoundError(path)
         return self.text.encode()
+
+
+def load_files(paths: Sequence[str | Path] | None, name: str) -> None:
+    """Run a user's plug-in files, each once; None: none. name: of the argument, for the message.
+
+    Raises InputError for what is no list of files, EffectError as `load_file`.
+    """
+    if isinstance(paths, str | os.PathLike):
+        raise InputError(f"{name} is {str(paths)!r}; it is a list of files: {name}=[{str(paths)!r}]")
+    if paths is not None and not isinstance(paths, Iterable):
+        raise InputError(f"{name} is {paths!r:.80}; it is a list of files: {name}=['my_effect.py']")
+    for path in paths or ():
+        if not isinstance(path, str | os.PathLike):
+            raise InputError(f"{name} holds {path!r:.80}; it is a list of files: {name}=['my_effect.py']")
+        load_file(path)
 
 
 def load_file(path: str | Path) -> None:

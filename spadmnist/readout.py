@@ -81,12 +81,12 @@ class Frames:
     def stamps(self, kind: type[np.floating] = np.float64) -> np.ndarray:
         """(images, frames, pixels), s since the start of the frame; the frame time where there is none: STR.
 
-        kind: of floats.
+        kind: of floats. No stamp becomes the frame time where it is rounded to them.
         """
         if self.first is None:
             raise SpadError("STR was not recorded")
         out = np.empty((len(self.bits) // self.pixels, self.frames, self.pixels), kind)
-        times, offsets = self.first.times.astype(kind, copy=False), self.first.offsets
+        times, offsets = _below(self.first.times, self.frame_time, kind), self.first.offsets
         for image, rows in enumerate(self._rows(len(out))):
             out[image] = self.frame_time  # just before, so that it is still in the cache
             bit_planes.stamps_first(self.bits[rows], offsets[rows.start : rows.stop + 1], times, out[image])
@@ -262,6 +262,13 @@ def _ones(bits: np.ndarray) -> np.ndarray:
     step = max(1, _BYTES_AT_ONCE // max(1, bits.shape[1]))
     parts = [np.bitwise_count(bits[i : i + step]).sum(axis=1, dtype=np.int64) for i in range(0, len(bits), step)]
     return np.concatenate([np.zeros(0, np.int64), *parts])
+
+
+def _below(stamps: np.ndarray, end: float, kind: type[np.floating]) -> np.ndarray:
+    """Stamps before `end` as floats of a kind, still before `end` as such a float."""
+    if kind is np.float64:
+        return stamps.astype(kind, copy=False)
+    return np.minimum(stamps.astype(kind), np.nextafter(kind(end), kind(0)))
 
 
 def counts_type(largest: int) -> type[np.unsignedinteger]:

@@ -26,6 +26,8 @@ MODALITIES = ("tr", "str", "qis", "counts")
 _FEW_TICKS = 64  # between the first stamp and the last: a rate changes within one
 # detections, at most, whose ticks are widened: they take 34 MB then, far less than what simulates as many
 _WIDENED = 1 << 22
+# s: the ticks in which a file holds times that have none: converters have 10 ps and more
+FINEST = 1e-12
 _EVENTS_AT_ONCE = 1 << 20  # detections whose arithmetic needs further memory
 _CHUNK = 16 * 2**20  # bytes of frames that are looked at together
 _BLOCKS = (16, 8, 4)  # of time, of which every other one makes half a capture: as many as lose no more than this
@@ -135,7 +137,7 @@ class Recording:
     ceil(columns / 8)) uint8; STR (frames, rows, columns) unsigned ticks since the start of the frame, `none` where
     there is no detection; counts (frames, rows, columns) unsigned. tick: s, of the stamps, None where they are seconds.
     dead_time: s, what the sensor's description states (its median), so that statistics know where to look; it is the
-    same for data and model.
+    same for data and model. untimed: the ticks of TR are those of a file alone, which holds times that had none.
     """
 
     capture: Capture
@@ -145,6 +147,7 @@ class Recording:
     tick: float | None = None
     dead_time: float = 0.0
     _kept: dict[str, object] = field(default_factory=dict, repr=False, compare=False)
+    untimed: bool = False
 
     @property
     def modality(self) -> str:
@@ -286,16 +289,26 @@ class Recording:
             end = no_detection(self.conditions.exposure, tick)
             ticks = np.empty(len(self.events), unsigned_for(end, "time stamps"))
             for part in _pieces(len(ticks)):
-                ticks[part] = _whole(self.events.times_of(part) / tick, end - 1)
+                ticks[part] = whole_ticks(self.events.times_of(part) / tick, end - 1)
             events = Events(None, self.events.offsets, self.pixels, ticks, tick, end=self.conditions.exposure)
-            return replace(self, events=events, tick=tick, _kept={})
+            return replace(self, events=events, tick=tick, untimed=False, _kept={})
         assert self.frames is not None and self.tick is not None
         none = no_detection(self.conditions.frame_time, tick)
         frames = np.empty(self.frames.shape, unsigned_for(none, "time stamps"))
         for start, stamps in self.chunks():
-            whole = _whole(stamps * (self.tick / tick), none - 1)
+            whole = whole_ticks(stamps * (self.tick / tick), none - 1)
             frames[start : start + len(stamps)] = np.where(stamps == self.none, none, whole)
         return replace(self, frames=frames, tick=tick, _kept={})
+
+    def by_clock(self, tick: float) -> Recording:
+        """TR without ticks of its own on those of a sensor's converter (s; 0: it has none); any other as it is.
+
+        The times are first those that a file would hold, so that a capture is the same before it is saved and after.
+        """
+        if self.events is None or not (self.tick is None or self.untimed):
+            return self
+        held = self.on_ticks(FINEST)
+        return held.on_ticks(tick) if tick else held
 
     def every_other(self, second: bool) -> Recording | None:
         """Every other block of time, one after the other, as a capture half as long; None where it is too short.
@@ -357,7 +370,7 @@ def _in_ticks(exposure: float) -> tuple[int, int]:
     return _BLOCKS[0], int(exposure / _BLOCKS[0])
 
 
-def _whole(stamps: np.ndarray, last: int) -> np.ndarray:
+def whole_ticks(stamps: np.ndarray, last: int) -> np.ndarray:
     """Stamps rounded down to whole ticks: what a product of two numbers lacks of one is none."""
     return np.minimum(np.floor(stamps + np.maximum(1e-6, 4 * np.spacing(stamps))), last)
 

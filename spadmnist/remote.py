@@ -26,6 +26,7 @@ from urllib.parse import urlsplit
 import google_crc32c
 
 from . import system
+from .document import path_of
 from .errors import InputError, SpadError
 from .foreign import quoted, short
 from .sources import PIECE, File, Source, Unreadable, tree
@@ -56,7 +57,7 @@ def at(place: str | os.PathLike[str], cache: Path | None = None) -> Path | Sourc
         if scheme[1].lower() not in _STORES:
             raise InputError(f"{place}: {scheme[1]}:// is not read; give a folder, a zip, or {_kinds()}")
         return Remote(place, cache)
-    path = Path(place)
+    path = path_of(place, "a dataset or a config")
     return Zip(path) if is_zip(path) else path
 
 

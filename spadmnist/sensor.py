@@ -138,7 +138,12 @@ class Sensor:
         what the sensor does not list, or a value that is not possible.
         """
         given: dict[str, dict[str, Any]] = {}
+        example = '{"dark_counts.rate": 250.0}'
+        if not isinstance(values, Mapping):
+            raise InputError(f"values are {values!r:.80}; they are a dictionary, {example}")
         for key, value in values.items():
+            if not isinstance(key, str):
+                raise InputError(f'the key {key!r:.80} is no name; write "effect.parameter", {example}')
             name, _, parameter = key.partition(".")
             listed = self._listed(name)
             if parameter not in listed.parameters:

@@ -149,6 +149,7 @@ class Events(_Set):
 
     def __init__(self, part: Part, transform: Callable[[EventBatch], Any] | None = None):
         super().__init__(part)
+        _check_transform(transform)
         self.transform = transform
         _ = part.tr  # says so where TR was not recorded
 
@@ -174,16 +175,24 @@ def _with_channel(images: np.ndarray, part: Part) -> np.ndarray:
 
 
 def _frames(part: Part, readout: str, index: Any) -> torch.Tensor:
-    return _of_frames(readout, getattr(part, readout)[index])
+    return _of_frames(readout, part.of_frames(readout, np.float32)[index])
 
 
 def _of_frames(readout: str, found: np.ndarray) -> torch.Tensor:
-    kind = {"qis": np.uint8, "str": np.float32, "counts": np.int32}[readout]
+    kind = np.int32 if readout == "counts" else found.dtype
     return torch.from_numpy(np.ascontiguousarray(found.astype(kind, copy=False)))
 
 
 def _transformed(events: EventBatch, transform: Callable[[EventBatch], Any] | None) -> Any:
     return events if transform is None else transform(events)
+
+
+def _check_transform(transform: Any, of_events: bool = True, instead: str = "") -> None:
+    """Raise SpadError for a transform that is no function, or where there are no events. instead: what to do."""
+    if transform is not None and not of_events:
+        raise SpadError(f"transform: is called with events, and {instead}, or leave transform out")
+    if transform is not None and not callable(transform):
+        raise SpadError(f"transform: is {transform!r:.80}; it is a function of events, for example ToFrames(...)")
 
 
 # --- a shuffled stream --------------------------------------------------------------------------------------------
@@ -219,6 +228,7 @@ class Stream(IterableDataset[Any]):
             raise SpadError(f"kind: {kind!r} is not possible; it is events, fluxes or frames")
         if kind == "events" and method is not None:
             raise SpadError("method: events have none; leave it out, or take kind='fluxes'")
+        _check_transform(transform, kind == "events", f"kind={kind!r} has none; take kind='events'")
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch, which gives another order from the next pass on. It reaches workers that are kept."""
@@ -360,7 +370,7 @@ class Stream(IterableDataset[Any]):
 
         def item(i: int) -> torch.Tensor:
             one = packed[i : i + 1] if isinstance(packed, np.ndarray) else packed.images(i, i + 1)
-            return _of_frames(readout, self.part.unpacked(readout, one)[0])
+            return _of_frames(readout, self.part.unpacked(readout, one, np.float32)[0])
 
         return item
 
@@ -564,19 +574,20 @@ class Simulated(Dataset[Any]):
             rows, columns) or PIL's (rows, columns, 3); unsigned integers, or floats from 0 to 1. PIL images are read
             as a folder's pictures are: palettes are their colours, what is transparent is black.
         sensor: as `read_sensor` gives it.
-        recording: a mapping, as in a config.
+        recording: a mapping, as in a config. `readouts` may be left out: then what `returns` needs is recorded.
         lux: a level (lux, or as "5 mlux"), or (low, high): then each image has a level of its own in each epoch, drawn
             evenly on a logarithmic scale.
         returns: the name of a reconstruction, for items of a float32 tensor (channels, rows, columns); or a readout:
-            "tr" (items of `spadmnist.Events`), "qis", "str" or "counts" (tensors as of `Frames`).
+            "tr" (items of `spadmnist.Events`), "qis", "str" or "counts" (tensors as of `Frames`). "counts" is the
+            readout where the recording has `bits` or lists `counts` among its readouts, and else the reconstruction.
         split, seed: they name the streams of random numbers.
         wavelength: of the light, m, or as "555 nm".
-        scale: a reconstruction is divided by it.
-        transform: called with the events of an image.
+        scale: a reconstruction is divided by it; a readout has none.
+        transform: called with the events of an image; for "tr" alone.
 
     Raises:
-        SpadError: for arguments that are not possible, for images of another size than the sensor's, and for an image
-            that is asked for a second time in one epoch.
+        SpadError: for arguments that are not possible, or mean nothing beside the others, for images of another size
+            than the sensor's, and for an image that is asked for a second time in one epoch.
     """
 
     def __init__(
@@ -597,13 +608,16 @@ class Simulated(Dataset[Any]):
         levels = list(lux) if isinstance(lux, tuple | list | np.ndarray) else [lux]
         if len(levels) not in (1, 2) or not all(isinstance(one, str | int | float | np.number) for one in levels):
             raise SpadError(f"lux: is {lux!r:.80}; give one level, or (low, high), as 0.005 or '5 mlux'")
-        methods = [returns] if returns in reconstruct.Method.registry else []
-        if not methods and returns not in READOUTS:
-            known = ", ".join([*READOUTS, *reconstruct.Method.registry])
-            raise SpadError(f"returns: {returns!r} is neither a readout nor a reconstruction; there are {known}")
-        needed = list(reconstruct.find(returns).readouts()) if methods else [returns]
+        self._method, readouts = _asked_for(returns, recording)
+        number = isinstance(scale, int | float | np.number) and not isinstance(scale, bool)
+        if not number or not 0 < scale < np.inf:
+            raise SpadError(f"scale: is {scale!r:.80}; it is a number of more than 0")
+        if self._method is None and scale != 1:
+            raise SpadError(f"scale: divides a reconstruction, and returns={returns!r} is a readout; leave scale out")
+        _check_transform(transform, self._method is None and returns == "tr", f"returns={returns!r}; take returns='tr'")
+        methods = [] if self._method is None else [self._method]
         self.experiment: Experiment = config.of_sensor(
-            sensor, {**recording, "readouts": needed}, levels, wavelength, methods, seed
+            sensor, {**recording, "readouts": readouts}, levels, wavelength, methods, seed
         )
         self.range = self.experiment.levels if len(levels) == 2 else None
         if self.range and not self.range[0].value < self.range[1].value:
@@ -643,7 +657,7 @@ class Simulated(Dataset[Any]):
         return [found[int(i)] for i in chosen]
 
     def _simulated(self, numbers: np.ndarray, wanted: np.ndarray, epoch: int) -> list[tuple[Any, int]]:
-        """The items `wanted` of the images `numbers`, which are simulated together."""
+        """The items `wanted` of the images `numbers`: one block, or any where the sensor has none."""
         shown = [_image(self.images[int(i)], f"image {i}") for i in numbers]
         layout, first = self.experiment.sensor.layout, shown[0].pixels
         for i, one in zip(numbers, shown, strict=True):
@@ -656,6 +670,22 @@ class Simulated(Dataset[Any]):
                 raise SpadError(
                     f"image {i} is {_kind(one.pixels)}, but image {numbers[0]} {_kind(first)}; convert all to one kind"
                 )
+        if self.experiment.sensor.block > 1:
+            return self._together(numbers, shown, wanted, epoch)
+        # light is worked out as exactly as its pixels are held: each kind for itself, as it is alone
+        kinds = [(one.pixels.dtype, one.white) for one in shown]
+        found: dict[int, tuple[Any, int]] = {}
+        for kind in dict.fromkeys(kinds):
+            mine = np.array([i for i, its in enumerate(kinds) if its == kind])
+            some = self._together(numbers[mine], [shown[i] for i in mine], np.arange(len(mine)), epoch)
+            found.update(zip(mine.tolist(), some, strict=True))
+        return [found[int(i)] for i in wanted]
+
+    def _together(
+        self, numbers: np.ndarray, shown: Sequence[_Shown], wanted: np.ndarray, epoch: int
+    ) -> list[tuple[Any, int]]:
+        """The items `wanted` of images that are simulated in one go; numbers: theirs."""
+        layout, first = self.experiment.sensor.layout, shown[0].pixels
         # in the first epoch the streams are those of `generate`
         split = self.split if epoch == 0 else f"{self.split}/epoch {epoch}"
         images, level = [one.pixels for one in shown], self.experiment.levels[0]
@@ -671,8 +701,8 @@ class Simulated(Dataset[Any]):
         made = self.experiment.simulate_numbered(level, split, np.stack(images), white, numbers)
         labels = [shown[int(i)].label for i in wanted]
         channels = first.shape[:-2]
-        if self.returns in reconstruct.Method.registry:
-            values, _ = self.experiment.image(reconstruct.find(self.returns), made)
+        if self._method is not None:
+            values, _ = self.experiment.image(reconstruct.find(self._method), made)
             images = values.reshape(len(numbers), *(channels or (1,)), *layout.shape)[wanted] / np.float32(self.scale)
             return list(zip(torch.from_numpy(images).unbind(), labels, strict=True))
         if self.returns == "tr":
@@ -707,6 +737,34 @@ class Simulated(Dataset[Any]):
         return out
 
 
+def _asked_for(returns: str, recording: Mapping[str, Any]) -> tuple[str | None, Any]:
+    """(the reconstruction, None for a readout; the readouts that are recorded). Raises SpadError with a sentence.
+
+    A name that is both is the readout where the recording says anything of it: its bits, or its name among `readouts`.
+    """
+    known = dict.fromkeys([*READOUTS, *reconstruct.Method.registry])
+    if not isinstance(returns, str) or returns not in known:
+        raise SpadError(f"returns: {returns!r} is neither a readout nor a reconstruction; there are {', '.join(known)}")
+    if not isinstance(recording, Mapping):
+        raise SpadError(f"recording: is {recording!r:.80}; it is a mapping as in a config, {{'exposure': '1 ms', ...}}")
+    given = recording.get("readouts")
+    listed = list(given) if isinstance(given, list | tuple) else []
+    is_both = returns in READOUTS and returns in reconstruct.Method.registry
+    said = recording.get("bits") is not None or returns in listed
+    method = returns if returns not in READOUTS or (is_both and not said) else None
+    needed = [returns] if method is None else list(reconstruct.find(method).readouts())
+    if given is None:
+        return method, needed
+    lacking = [name for name in needed if name not in listed]
+    if listed and lacking:
+        why = " (the readout, as the recording has bits)" if is_both and method is None else ""
+        raise SpadError(
+            f"recording: its readouts are {', '.join(map(str, listed))}, but returns={returns!r}{why} needs "
+            f"{', '.join(lacking)}; add it to them, or leave readouts out"
+        )
+    return method, listed or given  # what is no list of readouts is told of where a config is read
+
+
 class _Shown(NamedTuple):
     """An item of somebody's set: grey levels, (rows, columns) or (channels, rows, columns); white; label."""
 
@@ -737,7 +795,7 @@ def _image(item: Any, place: str) -> _Shown:
         raise SpadError(
             f"{place}: an image of {array.dtype} is not from 0 to 1; give uint8, uint16, or floats from 0 to 1"
         )
-    return _Shown(array.astype(np.float64), 1.0, int(label))
+    return _Shown(array.astype(np.float32), 1.0, int(label))  # as the source `array` holds them
 
 
 def _plain(image: Any, place: str) -> tuple[np.ndarray, np.ndarray | None]:

@@ -49,6 +49,9 @@ class Window:
     @staticmethod
     def of(whole: tuple[int, int], rows: slice, columns: slice) -> Window:
         """These rows and columns of a chip of so many. Raises InputError where there is nothing, or none of that."""
+        for name, part in (("rows", rows), ("columns", columns)):
+            if not isinstance(part, slice):
+                raise InputError(f"{name}: {part!r:.80} is no slice; give slice(100, 150) for the {name} 100 to 149")
         text = f"crop {_shown(rows)},{_shown(columns)}"
         return Window(*_ends(rows, whole[0], "row", text), *_ends(columns, whole[1], "column", text), whole)
 

@@ -248,6 +248,11 @@ def test_a_sensor_shows_itself_and_changes() -> None:
         (lambda s: s.with_values({"tdc.rounding": "up"}), "it is nearest or floor"),
         (lambda s: s.with_values({"detection.pdp": {500e-9: 0.4}}), "ByWavelength"),
         (lambda s: s.with_values({"tdc.resolution": np.ones(15)}), "one number for all pixels"),
+        (lambda s: s.with_values({("dark_counts", "rate"): 250.0}), r"key \('dark_counts', 'rate'\) is no name; write"),
+        (lambda s: s.with_values([("dark_counts.rate", 250.0)]), "values are .*; they are a dictionary"),
+        (lambda s: s.with_values(None), "values are None; they are a dictionary"),
+        (lambda s: s.cropped(1, 2), r"rows: 1 is no slice; give slice\(100, 150\)"),
+        (lambda s: s.cropped(slice(0, 2), "0:2"), "columns: '0:2' is no slice"),
     ],
 )
 def test_what_no_sensor_can_have_is_one_sentence(change: Any, said: str) -> None:
@@ -399,6 +404,22 @@ UNKNOWN = sp.Capture("mean", "qis", wavelength=500e-9, frames=1000, frame_time=1
 MEAN = measurements.in_memory("mean", sensor().layout, [replace(UNKNOWN, mean=470.0)])
 
 
+def found_nothing(model: Any) -> answers.Diagnosis:
+    lists: list[Any] = [[] for _ in range(7)]
+    return answers.Diagnosis(results.Diagnosis("one", "lab", "unexplained", 1.5, 1.5, 1.2, *lists), model)
+
+
+def test_none_and_numbers_of_numpy_are_taken() -> None:
+    lab = sp.Measurement.from_arrays(sensor().layout, LAB)
+    taken = {"seed": np.int64(3), "jobs": np.int32(1), "plugins": None}
+    gof = sp.compare(sensor(), lab, tolerance=np.float32(0.125), **taken)
+    assert gof.tolerance == 0.125 and type(gof.tolerance) is float and type(gof.origin.seed) is int
+    assert gof.figure(np.int64(0)).axes
+    for more in ({"max_steps": np.int64(3), "quick": np.True_}, {"within": np.float32(20)}):
+        with pytest.raises(InputError, match="nothing here can be compared"):  # it is looked at after them
+            sp.diagnose(sensor(), MEAN, **taken, **more)
+
+
 @pytest.mark.parametrize(
     ("call", "said"),
     [
@@ -415,6 +436,24 @@ MEAN = measurements.in_memory("mean", sensor().layout, [replace(UNKNOWN, mean=47
         (lambda s, lab: sp.compare(s, lab, jobs=0), "jobs is 0; it is a whole number of at least 1"),
         (lambda s, lab: sp.compare(s, lab, tolerance="0.5 %"), "tolerance is '0.5 %'; it is a share"),
         (lambda s, lab: sp.compare(s, lab, plugins="own.py"), r"plugins is 'own.py'; .*plugins=\['own.py'\]"),
+        (lambda s, lab: sp.compare(s, lab, plugins=3), r"plugins is 3; it is a list of files: plugins=\['my_eff"),
+        (lambda s, lab: sp.simulate(s, [FLAT], plugins=[None]), "plugins holds None; it is a list of files"),
+        (lambda s, lab: sp.open("lab.yaml", plugin="own.py"), r"plugin is 'own.py'; .*plugin=\['own.py'\]"),
+        (lambda s, lab: sp.open(None), "None is of type NoneType; give the path of a dataset or a config"),
+        (lambda s, lab: sp.simulate(s, [FLAT], folder=3), "3 is of type int; give the path of the folder to wr"),
+        (lambda s, lab: lab.save(None), "None is of type NoneType; give the path of the folder to write to"),
+        (lambda s, lab: compared().save(None), "None is of type NoneType; give the path of the folder of the rep"),
+        (lambda s, lab: found_nothing(s).save(None), "give the path of the folder of the report"),
+        (lambda s, lab: found_nothing(s).write_report(3), "give the path of the folder of the report"),
+        (lambda s, lab: found_nothing(s).write_sensor(None), "give the path of the sensor file to write"),
+        (lambda s, lab: found_nothing(s).write_answer(None), "give the path of the file to write"),
+        (lambda s, lab: sp.compare(s, MEAN, tolerance=True), "tolerance is True; it is a share"),
+        (lambda s, lab: sp.diagnose(s, MEAN, keep=3), "3 is of type int; give the path of the folder to keep"),
+        (lambda s, lab: sp.diagnose(s, MEAN, on_step=3), "on_step is 3; it is a function"),
+        (lambda s, lab: sp.diagnose(s, MEAN, quick="no"), "quick is 'no'; it is True or False"),
+        (lambda s, lab: sp.diagnose(s, MEAN, within=True), "within: True is no time"),
+        (lambda s, lab: sp.diagnose(s, MEAN, within=np.True_), "within: .*True.* is no time"),
+        (lambda s, lab: sp.diagnose(s, MEAN, max_steps=np.arange(2)), "max_steps is .*; it is a whole number"),
         (lambda s, lab: sp.compare(s, lab, progress=3), "progress is 3; it is a function"),
         (lambda s, lab: sp.compare(s, lab, crop=(0, 1)), r"crop is \(0, 1\); it is \"100:150,200:250\""),
         (lambda s, lab: sp.diagnose(s, lab, crop="0:1,0:2"), "layout has 3 x 5 pixels, but the sensor 1 x 2"),
@@ -611,6 +650,37 @@ def test_times_of_any_kind_are_compared(kind: str) -> None:
     capture, times, pixels = stamps_of(sensor())
     data = sp.Measurement.from_arrays(sensor().layout, {capture: (times.astype(kind), pixels.astype(">i4"))})
     assert sp.compare(sensor(), data, jobs=1).verdict == "adequate"
+
+
+@pytest.mark.parametrize("clocked", [True, False])
+def test_times_without_ticks_are_compared_alike_before_and_after_they_are_saved(tmp_path: Path, clocked: bool) -> None:
+    """Of a file they are in its ticks, which are not those of a converter."""
+    dark = sp.Capture("dark", "tr", dark=True, exposure=5e-3)
+    rng = np.random.default_rng(4)
+    times, pixels = np.sort(rng.uniform(0, 5e-3, 60)), rng.integers(0, 4, 60)
+    times[:30] = np.rint(times[:30] / 1e-9) * 1e-9  # as a converter of 1 ns gives them, in s
+    model = sensor(2, 2) if clocked else sensor(2, 2).without("tdc")
+    lab = sp.Measurement.from_arrays(model.layout, {dark: (times, pixels)})
+    again = sp.open_measurement(lab.save(tmp_path / "lab"))
+    held, read = (one.recording("dark", model).events for one in (lab, again))
+    assert held is not None and read is not None
+    assert held.tick == read.tick == (1e-9 if clocked else 1e-12) and np.array_equal(held.times, read.times)
+    first, second = (sp.compare(model, one, jobs=1).as_data() for one in (lab, again))
+    assert first["checks"] and first == second
+    twice = sp.open_measurement(again.save(tmp_path / "again"))
+    assert (tmp_path / "again/dark.h5").read_bytes() == (tmp_path / "lab/dark.h5").read_bytes()
+    assert twice.recording("dark").untimed and again["dark"].events.tick == 1e-12
+
+
+def test_a_damaged_mark_of_times_without_ticks_is_a_sentence(tmp_path: Path) -> None:
+    import h5py
+
+    dark = sp.Capture("dark", "tr", dark=True, exposure=5e-3)
+    folder = sp.Measurement.from_arrays(sensor().layout, {dark: ([1e-3], [2])}).save(tmp_path / "lab")
+    with h5py.File(folder / "dark.h5", "r+") as file:
+        file.attrs["untimed"] = 7
+    with pytest.raises(InputError, match="the attribute untimed is '7'; it is 0 or 1"):
+        sp.open_measurement(folder)
 
 
 def test_what_is_masked_is_no_data() -> None:

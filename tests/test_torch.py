@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import itertools
 import pickle
@@ -502,6 +503,10 @@ def test_a_stream_of_several_levels_and_of_a_config(dataset: spadmnist.Dataset, 
         (lambda p: st.stream(p, "events", method="counts"), "events have none"),
         (lambda p: st.stream(p, "fluxes", method="none"), "'none' is no reconstruction of this part; there are counts"),
         (lambda p: st.stream(p, buffer=0), "buffer: 0"),
+        (lambda p: st.stream(p, "fluxes", transform=len), "transform: is called with events, and kind='fluxes' has"),
+        (lambda p: st.stream(p, "frames", transform=len), "take kind='events', or leave transform out"),
+        (lambda p: st.stream(p, transform="frames"), "transform: is 'frames'; it is a function of events"),
+        (lambda p: st.Events(p, transform=3), "transform: is 3; it is a function of events"),
         (lambda p: st.stream(p).set_epoch(-1), "epoch: -1"),
         (lambda p: st.Frames(p, "tr"), "'tr' is no readout of frames"),
         (lambda p: st.Fluxes(p, "none"), "'none' is no reconstruction"),
@@ -540,9 +545,8 @@ def sensor(folder: Path) -> Any:
 
 
 def simulated(pictures: Any, sensor: Any, returns: str = "counts", **more: Any) -> st.Simulated:
-    recording = {**RECORDING, **({"bits": 2} if returns == "counts_readout" else {})}
     return st.Simulated(
-        pictures, sensor, **{"recording": recording, "lux": "30 lux", "seed": 3, "returns": returns, **more}
+        pictures, sensor, **{"recording": RECORDING, "lux": "30 lux", "seed": 3, "returns": returns, **more}
     )
 
 
@@ -556,6 +560,76 @@ def test_the_first_epoch_is_that_of_generate(part: spadmnist.Part, pictures: Any
             right = part.reconstruction[returns][i][None]
         assert np.array_equal(values(item), right.astype(values(item).dtype)), i
         assert label == part.labels[i]  # type: ignore[index]
+
+
+@pytest.mark.parametrize("recording", [{"bits": 2}, {"bits": 2, "readouts": ["tr", "counts"]}])
+def test_counts_are_the_readout_where_the_recording_has_them(
+    part: spadmnist.Part, pictures: Any, sensor: Any, recording: Any
+) -> None:
+    made = simulated(pictures, sensor, "counts", recording={**RECORDING, **recording})
+    for i, (item, _) in zip([4, 60, 0], made.__getitems__([4, 60, 0]), strict=True):
+        assert item.dtype == torch.int32 and np.array_equal(values(item), part.counts[i]), i
+
+
+def test_counts_in_colour_are_the_readout(pictures: Any, sensor: Any) -> None:
+    colour = np.stack([pictures.images[0], 255 - pictures.images[0]])
+    item = simulated([colour], sensor, recording={**RECORDING, "bits": 2})[0][0]
+    assert item.shape == (2, 1, 28, 28) and item[1].sum() > item[0].sum() > 0
+
+
+def test_readouts_that_a_recording_lists_are_kept(pictures: Any, sensor: Any) -> None:
+    made = simulated(pictures, sensor, "qis", recording={**RECORDING, "readouts": ["tr", "qis"]})
+    assert made.experiment.readouts == ("tr", "qis")
+    assert torch.equal(made[3][0], simulated(pictures, sensor, "qis")[3][0])
+
+
+FLOATS = """
+seed: 3
+scene: {images: {source: array, path: images.npy}, wavelength: WAVELENGTH, lux: [30 lux]}
+recording: {exposure: 30 us, readouts: [tr]}
+sensor:
+  layout: {rows: 28, columns: 28, pixel_area: 25 um^2, fill_factor: 1}
+  effects: {detection: {pdp: 0.5}}
+"""
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("wavelength", [["555 nm"], ["600 nm", "550 nm", "500 nm"]])
+def test_floats_are_those_of_the_array_source(
+    pictures: Any, tmp_path: Path, kind: type[np.floating], wavelength: list[str]
+) -> None:
+    """To the last digit of times that no converter rounds."""
+    shades = pictures.images[:4] / 255.0
+    images = (shades if len(wavelength) == 1 else np.stack([shades, shades[::-1], 1 - shades], axis=1)).astype(kind)
+    np.save(tmp_path / "images.npy", images)
+    file = tmp_path / "lab.yaml"
+    file.write_text(FLOATS.replace("WAVELENGTH", wavelength[0] if len(wavelength) == 1 else f"{wavelength}"))
+    part = spadmnist.open(file)["30 lux", "train"]
+    light = wavelength[0] if len(wavelength) == 1 else wavelength
+    more = {"recording": {"exposure": "30 us"}, "wavelength": light}
+    made = simulated(images, spadmnist.read_sensor(file), "tr", **more)
+    for i, (item, _) in enumerate(made.__getitems__(range(4))):
+        assert len(item) > 1000 and np.array_equal(item.times, part.tr[i].times), i
+    if len(wavelength) == 1:  # beside an image of another kind, too
+        beside = simulated([images[0], pictures.images[1]], spadmnist.read_sensor(file), "tr", **more)
+        assert np.array_equal(beside.__getitems__([0, 1])[0][0].times, part.tr[0].times)
+
+
+def test_no_stamp_becomes_none_in_single_precision(tmp_path: Path) -> None:
+    """Frames of 1 ms and ticks of 10 ps: as a float32 the last tick would be the frame time."""
+    file = tmp_path / "lab.yaml"
+    text = CONFIG.replace("READOUTS", "[str]").replace(", bits: 2", "").replace("resolution: 1 ns", "resolution: 10 ps")
+    text = text.replace("exposure: 30 us, frames: 3, frame_time: 8 us, frame_period: 10 us", "RECORDING")
+    clock = {"exposure": "3 ms", "frames": 3, "frame_time": "1 ms", "frame_period": "1 ms"}
+    file.write_text(text.replace("RECORDING", ", ".join(f"{k}: {v}" for k, v in clock.items())))
+    part = spadmnist.open(file)["2 lux", "train"][:1]
+    frames = part.frames[0]
+    assert frames.first is not None and frames.first.tick == 1e-11 and frames.first.ticks is not None
+    late = frames.first.stamped(np.full_like(frames.first.ticks, 10**8 - 1), 1e-11)
+    rounded = dataclasses.replace(frames, first=late).stamps(np.float32)
+    assert np.array_equal(rounded < np.float32(1e-3), frames.unpacked() == 1) and (rounded < 1e-3).any()
+    item, _ = st.Frames(part, "str")[0]
+    assert np.array_equal(item.numpy(), np.minimum(part.str[0].astype(np.float32), np.float32(1e-3)))
 
 
 BLUR = '''
@@ -731,6 +805,36 @@ def test_an_index_is_a_whole_number(part: spadmnist.Part, sensor: Any, pictures:
         (np.full((2, 28, 28), 2.0), {}, SpadError, "is not from 0 to 1"),
         (np.zeros((2, 28, 28), np.int64), {}, SpadError, "give uint8, uint16, or floats"),
         (np.zeros((2, 28, 28), np.uint8), {"returns": "photons"}, SpadError, "neither a readout nor a reconstruction"),
+        (
+            np.zeros((2, 28, 28), np.uint8),
+            {"returns": ["qis"]},
+            SpadError,
+            "there are tr, str, qis, counts, inter_photon",
+        ),
+        (np.zeros((2, 28, 28), np.uint8), {"recording": 3}, SpadError, "recording: is 3; it is a mapping"),
+        (
+            np.zeros((2, 28, 28), np.uint8),
+            {"returns": "qis", "recording": {**RECORDING, "readouts": ["tr"]}},
+            SpadError,
+            "recording: its readouts are tr, but returns='qis' needs qis; add it to them, or leave readouts out",
+        ),
+        (
+            np.zeros((2, 28, 28), np.uint8),
+            {"recording": {**RECORDING, "bits": 2, "readouts": ["tr"]}},
+            SpadError,
+            r"returns='counts' \(the readout, as the recording has bits\) needs counts",
+        ),
+        (
+            np.zeros((2, 28, 28), np.uint8),
+            {"returns": "tr", "recording": {**RECORDING, "readouts": "tr"}},
+            ConfigError,
+            "readouts",
+        ),
+        (np.zeros((2, 28, 28), np.uint8), {"returns": "qis", "scale": 2.0}, SpadError, "scale: divides a reconstruc"),
+        (np.zeros((2, 28, 28), np.uint8), {"scale": 0}, SpadError, "scale: is 0; it is a number of more than 0"),
+        (np.zeros((2, 28, 28), np.uint8), {"scale": True}, SpadError, "scale: is True"),
+        (np.zeros((2, 28, 28), np.uint8), {"transform": len}, SpadError, "transform: is called with events, and ret"),
+        (np.zeros((2, 28, 28), np.uint8), {"returns": "tr", "transform": 3}, SpadError, "transform: is 3; it is a fun"),
         (np.zeros((2, 28, 28), np.uint8), {"lux": (1, 2, 3)}, SpadError, "give one level, or"),
         (np.zeros((2, 28, 28), np.uint8), {"lux": (2.0, 1.0)}, SpadError, r"is not below"),
         (np.zeros((2, 28, 28), np.uint8), {"lux": "5 nm"}, ConfigError, "lux"),

@@ -11,6 +11,8 @@ import re
 import time
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from .. import units
 from ..errors import InputError
 from ..recording import Capture
@@ -107,6 +109,8 @@ def seconds_of(within: str | float | None, quick: bool) -> float:
         return _QUICK if quick else _DEFAULT
     if isinstance(within, str) and within.strip().lower() == "none":
         return math.inf
+    if isinstance(within, bool | np.bool_):
+        raise InputError(f"within: {within!r} is no time; write a number and h, min or s, for example 10 min")
     stated = _LONG.fullmatch(within) if isinstance(within, str) else None
     try:
         if stated is not None:

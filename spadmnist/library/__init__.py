@@ -25,11 +25,12 @@ import numpy as np
 from .. import measurement as measurements
 from .. import twin, units, window
 from ..config import read_sensor
+from ..document import path_of
 from ..errors import InputError, SpadError
 from ..factory import Progress
 from ..foreign import quoted
 from ..measurement import Measurement
-from ..plugins import check_values, discover, load_file
+from ..plugins import check_values, discover, load_files
 from ..recording import Capture
 from ..sensor import Sensor
 from ..sensor_file import original
@@ -51,7 +52,7 @@ def simulate(
     *,
     folder: PathLike | None = None,
     crop: Crop | None = None,
-    plugins: Sequence[PathLike] = (),
+    plugins: Sequence[PathLike] | None = (),
     progress: Told | None = None,
 ) -> Measurement:
     """The captures of a plan as the sensor would have recorded them.
@@ -71,7 +72,8 @@ def simulate(
         SpadError: where something else lies in the folder, or it cannot be written.
     """
     bar = _bar(progress)
-    _check_seed(seed)
+    folder = None if folder is None else path_of(folder, "the folder to write to")
+    seed = _seed(seed)
     model = _model(sensor, plugins, crop)
     opened = _plan(plan, model)
     _say_notes(opened, bar.notice)
@@ -89,7 +91,7 @@ def compare(
     tolerance: float | None = None,
     crop: Crop | None = None,
     jobs: int | Executor | None = None,
-    plugins: Sequence[PathLike] = (),
+    plugins: Sequence[PathLike] | None = (),
     progress: Told | None = None,
 ) -> Comparison:
     """The goodness of fit of a model: every statistic of every capture against the model's own scatter.
@@ -113,10 +115,15 @@ def compare(
     from ..inference import comparison
     from .answers import Comparison
 
-    if tolerance is not None and not (isinstance(tolerance, int | float) and 0 < tolerance < 1):
-        raise InputError(f"tolerance is {tolerance!r}; it is a share of more than 0 and less than 1, 0.005 for 0.5 %")
+    if tolerance is not None:
+        number = isinstance(tolerance, int | float | np.number) and not isinstance(tolerance, bool)
+        if not (number and 0 < tolerance < 1):
+            raise InputError(
+                f"tolerance is {tolerance!r}; it is a share of more than 0 and less than 1, 0.005 for 0.5 %"
+            )
+        tolerance = float(tolerance)
     workers, bar, done = _workers(jobs), _bar(progress), 0.0
-    _check_seed(seed)
+    seed = _seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
     origin = _origin(sensor, data, seed)
     _say_notes(data, bar.notice)
@@ -142,7 +149,7 @@ def diagnose(
     within: str | float | None = None,
     crop: Crop | None = None,
     jobs: int | Executor | None = None,
-    plugins: Sequence[PathLike] = (),
+    plugins: Sequence[PathLike] | None = (),
     progress: Told | None = None,
     keep: PathLike | None = None,
     on_step: Callable[[Diagnosis], None] | None = None,
@@ -170,10 +177,16 @@ def diagnose(
     from ..inference.journal import FOLDER, Journal
     from .answers import Diagnosis, check_place
 
-    if isinstance(max_steps, bool) or max_steps not in range(1, 13):
+    if not _is_whole(max_steps) or not 1 <= max_steps <= 12:
         raise InputError(f"max_steps is {max_steps!r}; it is a whole number from 1 to 12")
+    if not isinstance(quick, bool | np.bool_):
+        raise InputError(f"quick is {quick!r}; it is True or False")
+    if on_step is not None and not callable(on_step):
+        raise InputError(f"on_step is {on_step!r:.80}; it is a function that is called with the diagnosis so far")
+    max_steps, quick = int(max_steps), bool(quick)
+    keep = None if keep is None else path_of(keep, "the folder to keep it in")
     seconds, workers, say = seconds_of(within, quick), _workers(jobs), _bar(progress).notice
-    _check_seed(seed)
+    seed = _seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
     origin = _origin(sensor, data, seed)
     _say_notes(data, say)
@@ -225,7 +238,7 @@ def fit(
     *,
     crop: Crop | None = None,
     jobs: int | Executor | None = None,
-    plugins: Sequence[PathLike] = (),
+    plugins: Sequence[PathLike] | None = (),
     progress: Told | None = None,
 ) -> Fit:
     """Parameters of the model fitted to a measurement, with 95 % intervals.
@@ -246,7 +259,7 @@ def fit(
 
     lists = _names("add", add), _names("free", free), _names("per_pixel", per_pixel)
     workers, say = _workers(jobs), _bar(progress).notice
-    _check_seed(seed)
+    seed = _seed(seed)
     model, data = _model(sensor, plugins, crop), _data(measurement)
     origin = _origin(sensor, data, seed)
     _say_notes(data, say)
@@ -257,11 +270,8 @@ def fit(
 # ---- what is given to them ----------------------------------------------------------------------------------
 
 
-def _model(sensor: Sensor | PathLike, files: Sequence[PathLike], crop: Crop | None) -> Sensor:
-    if isinstance(files, str | os.PathLike):
-        raise InputError(f"plugins is {str(files)!r}; it is a list of files: plugins=[{str(files)!r}]")
-    for file in files:
-        load_file(file)
+def _model(sensor: Sensor | PathLike, files: Sequence[PathLike] | None, crop: Crop | None) -> Sensor:
+    load_files(files, "plugins")
     discover()
     if isinstance(sensor, Sensor):
         for effect in sensor.effects:
@@ -318,10 +328,14 @@ def _names(name: str, given: Iterable[str]) -> tuple[str, ...]:
     return names
 
 
-def _check_seed(seed: int) -> None:
-    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-    if not whole or not 0 <= seed < 1 << 63:
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def _seed(seed: int) -> int:
+    if not _is_whole(seed) or not 0 <= seed < 1 << 63:
         raise InputError(f"seed is {seed!r}; it is a whole number from 0 to 2^63 - 1")
+    return int(seed)
 
 
 def _plan(plan: Measurement | PathLike | Sequence[Capture], model: Sensor) -> Measurement:
@@ -354,9 +368,11 @@ def _origin(sensor: Sensor | PathLike, data: Measurement, seed: int) -> Origin:
 def _workers(jobs: int | Executor | None) -> int | Executor:
     if jobs is None:
         return processors()
-    if not isinstance(jobs, Executor) and (isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1):
+    if isinstance(jobs, Executor):
+        return jobs
+    if not _is_whole(jobs) or jobs < 1:
         raise InputError(f"jobs is {jobs!r}; it is a whole number of at least 1, or None for one worker per processor")
-    return jobs
+    return int(jobs)
 
 
 def _bar(told: Told | None) -> Progress:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from .. import disk, pages, sensor_file
+from ..document import path_of
 from ..errors import InputError, SpadError
 from ..foreign import html_table
 from ..inference import candidates, comparison, results
@@ -167,7 +168,7 @@ class Comparison(comparison.Comparison):
         Raises:
             SpadError: where something else lies there, or it cannot be written.
         """
-        return pages.comparison(self, Path(folder), self.origin.source(command, then))
+        return pages.comparison(self, path_of(folder, "the folder of the report"), self.origin.source(command, then))
 
     def __repr__(self) -> str:
         return comparison.table(self)
@@ -299,7 +300,7 @@ class _Found:
             SpadError: where something else lies there, or it cannot be written. Where the sensor file cannot, the
                 report is written all the same, and says why.
         """
-        place = Path(folder)
+        place = path_of(folder, "the folder of the report")
         check_place(place, self.origin.sensor)
         self.write_sensor(place / SENSOR)
         self.write_answer(place / ANSWER)
@@ -317,7 +318,7 @@ class _Found:
         Returns:
             The path of the file; None where it cannot be written.
         """
-        out, notes, origin = Path(file), results.notes(self.found), self.origin
+        out, notes, origin = path_of(file, "the sensor file to write"), results.notes(self.found), self.origin
         self.found.file, self.found.unwritten = None, ""
         try:
             with disk.writing_file(out):
@@ -345,10 +346,11 @@ class _Found:
         Raises:
             SpadError: where something else lies there, or it cannot be written.
         """
-        check_answer(file)
-        with disk.writing_file(Path(file)):
-            disk.put_file(Path(file), (results.canonical(self.found) + "\n").encode())
-        return Path(file)
+        place = path_of(file, "the file to write")
+        check_answer(place)
+        with disk.writing_file(place):
+            disk.put_file(place, (results.canonical(self.found) + "\n").encode())
+        return place
 
     def write_report(self, folder: PathLike, *, command: str = "", then: str = "") -> Path:
         """Write the report, one HTML page, into a folder. command, then: as of `save`.
@@ -361,9 +363,10 @@ class _Found:
         Raises:
             SpadError: where something else lies there, or it cannot be written.
         """
-        page = pages.diagnosis(self.found, Path(folder), self.origin.source(command, then, self.found.file))
+        place = path_of(folder, "the folder of the report")
+        page = pages.diagnosis(self.found, place, self.origin.source(command, then, self.found.file))
         kept = self.journal
-        if kept is not None and self.found.finished and not self.unwritten and kept.folder.parent == Path(folder):
+        if kept is not None and self.found.finished and not self.unwritten and kept.folder.parent == place:
             kept.remove()
             self.journal = None
         return page
@@ -515,6 +518,6 @@ def _by_name(drawn: Mapping[str, Callable[[], Figure]], name: str) -> Figure:
 def _nth(drawn: Sequence[T], i: int, what: str) -> T:
     if not drawn:
         raise InputError(f"figure {i!r}: there are no {what} to draw")
-    if isinstance(i, bool) or not isinstance(i, int) or not 0 <= i < len(drawn):
+    if isinstance(i, bool) or not isinstance(i, int | np.integer) or not 0 <= i < len(drawn):
         raise InputError(f"figure {i!r}: there are {len(drawn)} {what}, counted from 0")
     return drawn[i]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import units
+from ..document import path_of
 from ..errors import InputError, did_you_mean
 from ..events import Layout
 from ..foreign import html_table, quoted
@@ -69,6 +70,7 @@ class Measurement:
         """Write it as `measurement.yaml` and a file for each capture; the folder. Raises SpadError as `write` does."""
         from .writer import write
 
+        folder = path_of(folder, "the folder to write to")
         data = (c if c.mean is not None else self.recording(c.id) for c in self.captures)
         return write(folder, self.name, self.layout, data, self.captures)
 
@@ -127,7 +129,7 @@ class Measurement:
     def recording(self, id: str, of: Sensor | Layout | None = None, dead_time: float = 0.0) -> Recording:
         """The data of a capture. of: the sensor, or its layout and nominal dead time (s), for statistics to know.
 
-        Times that are no whole ticks of a file are put on the ticks of the sensor's converter, where it has one.
+        Times that have no ticks of their own are put on those of the sensor's converter, else on those of a file.
 
         Raises InputError where the file cannot be used, where the sensor has other pixels, and for a capture of which
         only the mean is known, or nothing yet.
@@ -142,9 +144,7 @@ class Measurement:
         if self.file is not None and self._paths[self._index(id)] is None:
             raise InputError(f"{self.place(id)}: {without_file(self.file, id)}")
         found, self.notes[id] = self._read(self._index(id), layout, dead_time)
-        if isinstance(of, Sensor) and found.modality == "tr" and found.tick is None and of.tick:
-            return found.on_ticks(of.tick)
-        return found
+        return found.by_clock(of.tick) if isinstance(of, Sensor) else found
 
     def check_sensor(self, sensor: Sensor) -> None:
         """Raise InputError where a sensor has other pixels, or says nothing of a capture's wavelength."""
