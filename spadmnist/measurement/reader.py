@@ -226,6 +226,9 @@ class _Reader(Reader):
             if entry.exposure is not None and abs(entry.exposure - c.exposure) > 1e-9 * entry.exposure:
                 whole = units.show(c.exposure, "s")
                 self.say((*path, "exposure"), f"{entry.exposure} is not frames x frame_period, {whole}; take it out")
+            if c.exposure > units.LONGEST:
+                whole = f"{c.exposure:g} s"
+                self.say((*path, "frames"), f"frames x frame_period is {whole}; it is at most {units.LONGEST:g} s")
             most = c.frames
         if isinstance(entry, Counts):
             # a file says itself whether its frames are counted, or those that they sum
