@@ -332,8 +332,15 @@ def _pixels(file: Any, groups: list[str], used: np.ndarray, path: Path) -> tuple
 
 
 def _count(file: Any, path: Path) -> int | None:
-    """What the file says of the number of its pixels."""
-    return None if _node(file, "setup/num_pixels", path) is None else int(_number(file, "setup/num_pixels", path))
+    """What the file says of the number of its pixels. Raises InputError where that is no such number."""
+    if _node(file, "setup/num_pixels", path) is None:
+        return None
+    number = _number(file, "setup/num_pixels", path)
+    if not 1 <= number <= MOST_CHANNELS or number != int(number):
+        raise InputError(
+            f"{path}: setup/num_pixels says {number:.15g}; it is a whole number from 1 to {MOST_CHANNELS:,}: correct it"
+        )
+    return int(number)
 
 
 def _specified(file: Any, groups: list[str], path: Path) -> set[int]:
@@ -357,7 +364,12 @@ def _listed(file: Any, name: str, path: Path) -> set[int]:
     found = _node(file, name, path)
     if found is None or found.dtype.kind not in "iu" or found.ndim > 1 or found.size > _MOST_DETECTORS:
         raise InputError(f"{path}: {name} is no list of detectors; write their numbers there")
-    return set(map(int, np.asarray(found[()]).ravel()))
+    numbers = set(map(int, np.asarray(found[()]).ravel()))
+    for wrong in (end for end in (min(numbers, default=0), max(numbers, default=0)) if not 0 <= end < MOST_CHANNELS):
+        raise InputError(
+            f"{path}: {name} names a detector {wrong}; their numbers are 0 to {MOST_CHANNELS - 1}: correct the file"
+        )
+    return numbers
 
 
 _MOST_DETECTORS = 1 << 20
