@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from .. import look, measurement, units
+from .. import disk, look, measurement, units
 from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
@@ -143,6 +143,7 @@ def import_files(
     planned = plan.read(out)
     if planned is None and ids:
         raise SpadError(f"--capture: {out} is no plan with captures that are missing; leave out --capture")
+    _check_twice(files)
     progress = progress or Progress()
     ones = _matched(files, said, planned, lights, name, ids)
     _check_options([(one.path, one.kind, one.kind.modalities, None) for one in ones], said)
@@ -249,6 +250,14 @@ def _matched(
         _One(path, kind, plan.said_with(said, planned, target), target.light, target)
         for path, kind, target in zip(files, kinds, targets, strict=True)
     ]
+
+
+def _check_twice(files: Sequence[Path]) -> None:
+    """Raise SpadError where two of the files are one: a recording is one capture."""
+    first: dict[Any, int] = {}
+    for i, path in enumerate(files):
+        if (at := first.setdefault(disk.identity(path), i)) != i:
+            raise SpadError(f"{path}: is the same file as {files[at]}, and a recording is one capture; name it once")
 
 
 def _recordings(

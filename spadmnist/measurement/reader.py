@@ -144,8 +144,12 @@ class _Reader(Reader):
             first: dict[Any, int] = {}
             for i, one in enumerate(raw):
                 name = one.get(what) if isinstance(one, Mapping) else None
-                if isinstance(name, str) and first.setdefault(name, i) != i:
-                    self.say(("captures", i, what), f"{name} is that of captures[{first[name]}]; give each {key} once")
+                if not isinstance(name, str):
+                    continue
+                same = disk.identity(self.base / name) if what == "file" and name.isprintable() else name
+                if (at := first.setdefault(same, i)) != i:
+                    is_file = "" if raw[at][what] == name else f"the same file as {raw[at][what]}, "
+                    self.say(("captures", i, what), f"{name} is {is_file}that of captures[{at}]; give each {key} once")
         return [one for one in found if one is not None]
 
     def capture(self, path: Path_, raw: Any, layout: Layout | None) -> tuple[Capture, Path | None] | None:
