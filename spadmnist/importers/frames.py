@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import lzma
 import math
+import re
 import weakref
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -160,15 +163,16 @@ class Tif(Format):
                 weakref.finalize(file, file.filehandle.close)
                 first, count = file.pages[0], len(file.pages)
                 shape, dtype = tuple(map(int, first.shape)), first.dtype
-                of_imagej = file.imagej_metadata or {}
-                declared, colours = int(of_imagej.get("images", 1)), int(of_imagej.get("channels", 1))
+                declared, axes = int((file.imagej_metadata or {}).get("images", 1)), _axes(file)
                 white_is_0 = first.photometric == tifffile.PHOTOMETRIC.MINISWHITE
         except Exception as error:  # damaged files make it raise nearly anything
             raise damaged(path, error) from None
-        if colours > 1:
+        several = {name: size for name, size in axes.sizes.items() if size > 1}
+        if len(several) > 1 or "channels" in several:
+            held = " and ".join(f"{size} {name}" for name, size in several.items() if name != "frames")
             raise InputError(
-                f"{path}: has {colours} channels (ImageJ), one after the other; store each by itself, or, where they "
-                "are frames, store it with frames (axes TYX)"
+                f"{path}: has {held} ({axes.of}), one after the other; store each by itself, or, where they are "
+                "frames, store it with frames (axes TYX)"
             )
         if len(shape) != 2 or dtype is None or dtype.kind not in "iubf" or declared > count:
             raise InputError(
@@ -206,6 +210,40 @@ class Tif(Format):
         notes = ("its pages show 0 as white; the numbers are taken as they stand, 0 as no detection",) * white_is_0
         stack = arranged((count, *shape), dtype, letters, get)
         return Found(frames=stack, bits=dtype.kind == "b", packed=said.packed, notes=notes)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """What the pages of a TIFF file are, as its description says: how many of each. of: who wrote the description."""
+
+    of: str = ""
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+
+_LETTERS = {"T": "frames", "C": "channels", "Z": "slices"}  # of axes in a description
+
+
+def _axes(file: Any) -> _Axes:
+    """The axes of an open TIFF file besides rows and columns, by its first page alone: series may lie in other files.
+
+    Raises ValueError for a description that cannot be read.
+    """
+    if of_imagej := file.imagej_metadata:
+        return _Axes("ImageJ", {name: int(of_imagej.get(name, 1)) for name in ("frames", "channels", "slices")})
+    first = file.pages[0]
+    if first.is_ome:
+        images = re.findall(r"<(?:\w+:)?Pixels\s[^>]*>", first.description)
+        sizes = [dict(re.findall(r"""\bSize([TCZ])\s*=\s*["'](\d{1,9})["']""", image)) for image in images]
+        most = {_LETTERS[key]: max((int(one.get(key, 1)) for one in sizes), default=1) for key in "TCZ"}
+        return _Axes("OME", {"images": len(images), **most})
+    described = [text for text in (first.description, first.description1) if text.startswith('{"shape":')]
+    if described:
+        told = json.loads(described[0])
+        shape, letters = told["shape"], str(told.get("axes", ""))
+        letters = letters if len(letters) == len(shape) else "?" * len(shape)
+        outer = list(zip(letters, shape, strict=True))[: -len(first.shape)]
+        return _Axes("tifffile", {_LETTERS.get(one, f"of axis {i}"): int(size) for i, (one, size) in enumerate(outer)})
+    return _Axes()
 
 
 def _check_page(file: Any, page: Any, path: Path) -> None:
