@@ -362,8 +362,8 @@ def _described(
     for key in ("bits",) if said.channels is not None else ("rows", "columns", "bits"):
         if getattr(said, key) is not None and found.facts.get(key, getattr(said, key)) != getattr(said, key):
             raise InputError(f"{path}: says that its {key} are {found.facts[key]}; leave out {word(key)}")
-    if said.counting == "frames" and found.facts.get("counter"):
-        raise InputError(f"{path}: says that its counts are those of a counter; leave out --counting")
+    if said.counting is not None and (there := found.facts.get("counting", said.counting)) != said.counting:
+        raise InputError(f"{path}: says that its counting is {there}; leave out --counting")
     for key in ("exposure", "frame_time", "frame_period"):
         if key in told and not math.isclose(found.facts.get(key, told[key]), told[key], rel_tol=1e-9):
             there = units.show(found.facts[key], "s", 9)
@@ -389,8 +389,7 @@ def _described(
         clock = Conditions(exposure, 1, exposure, exposure, lit.wavelength, scene=lit.scene)
     else:
         bits = known["bits"] if modality == "counts" else 0
-        counter = said.counting == "counter" if said.counting else known.get("counter") == 1
-        counting = "counter" if counter and bits else "frames"
+        counting = (said.counting or known.get("counting", "frames")) if bits else "frames"
         if not 0 <= bits <= 16:
             raise InputError(f"{path}: counts of {bits} bits are not possible; give --bits from 1 to 16")
         held, each = found.frames.shape[0], 1 if counting == "counter" or not bits else (1 << bits) - 1

@@ -25,6 +25,7 @@ from . import (
     FACTS,
     GZIP,
     LARGEST_PIECE,
+    WORDS,
     Format,
     Found,
     Said,
@@ -34,6 +35,7 @@ from . import (
     frames_in_file,
     heard,
     holds_detections,
+    in_words,
     is_packed,
     library,
     one_axis,
@@ -46,6 +48,8 @@ from .stacks import arranged, cut
 _COUNTED = 1 << 20  # bytes that are unpacked at a time, to be counted
 _LZMA_MEMORY = 1 << 27  # bytes that LZMA may take to unpack: its largest usual dictionary has half of them
 _FRAMES = tuple(name for name in MODALITIES if name != "tr")
+_ARRAYS = ("time", "pixel", "frames")
+_LONGEST_WORD = 4096  # bytes of a member that is a word, its header included
 
 
 class Npy(Format):
@@ -92,7 +96,8 @@ class Npy(Format):
 
 
 class Npz(Format):
-    """A NumPy archive of time and pixel, or of frames, and of numbers by the names of `FACTS`, as `export` writes it.
+    """A NumPy archive of time and pixel, or of frames, and of what it says of itself by the names of `FACTS` and
+    `WORDS`, as `export` writes it.
 
     It is read whole: for a large stack HDF5 or .npy is better.
     """
@@ -108,15 +113,16 @@ class Npz(Format):
             with zipfile.ZipFile(path) as archive:
                 held = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
                 size, parts = path.stat().st_size, {}
-                declared = sum(held[name].file_size for name in ("time", "pixel", "frames") if name in held)
+                declared = sum(held[name].file_size for name in _ARRAYS if name in held)
                 if declared > LARGEST_PIECE:
                     raise InputError(
                         f"{path}: unpacks to {declared:,} bytes, more than the {LARGEST_PIECE:,} that are read whole; "
                         "store HDF5 or .npy, which are read piece by piece"
                     )
-                for name in (*FACTS, "time", "pixel", "frames"):
+                for name in (*FACTS, *_ARRAYS):
                     if name in held:
                         parts[name] = image_files.read_member(archive, held[name], size, f"{path}: {name}")
+                words = {name: _word(archive, held[name], path) for name in WORDS if name in held}
         except (zipfile.BadZipFile, OSError, RuntimeError, ValueError, NotImplementedError) as error:
             raise damaged(path, error) from None
         for name in set(FACTS) & set(parts):
@@ -126,20 +132,45 @@ class Npz(Format):
         plain = {name: part for name, part in parts.items() if name not in FACTS and part.dtype.kind in "iubf"}
         sources = dict.fromkeys(known, "the file")
         stacked = "frames" in plain and plain["frames"].ndim == 3
-        if stacked and not holds_detections(path, plain, stacked, said):
+        others = sorted(set(held) - {*FACTS, *WORDS, *_ARRAYS})
+        row = ", ".join(visible(name)[:40] for name in others[:8]) + ", ..." * (len(others) > 8)
+        notes = (
+            f"holds {row} as well, which was not read; what is read besides the data is {', '.join((*FACTS, *WORDS))}",
+        ) * bool(others)
+        if stacked and not holds_detections(path, plain, stacked, said.modality or words.get("modality")):
             frames = plain["frames"]
+            known |= in_words(path, words.get, False, known)
             packed = is_packed(path, frames.shape, known, said)
             letters = "MHW" if packed else said.axes or "MHW"
             stack = arranged(frames.shape, frames.dtype, letters, lambda a, b: frames[cut(letters, a, b)])
-            return Found(known, frames=stack, bits=frames.dtype.kind == "b", packed=packed, sources=sources)
+            bits = frames.dtype.kind == "b"
+            return Found(known, frames=stack, bits=bits, packed=packed, sources=sources, notes=notes)
         if {"time", "pixel"} <= set(plain):
             refuse_fine_times(path, held)
+            known |= in_words(path, words.get, True, known)
             time, pixel = (whole(one_axis(plain[name], name, path), name, path) for name in ("time", "pixel"))
-            return Found(known, Detections.of(path, pixel, time), sources=sources)
+            return Found(known, Detections.of(path, pixel, time), sources=sources, notes=notes)
         there = ", ".join(visible(name) for name in sorted(held)[:8])[:200]
         raise InputError(
             f"{path}: holds {there}; it needs whole numbers time and pixel, or frames (frames, rows, columns)"
         )
+
+
+def _word(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> str:
+    """A text of an archive. Raises InputError where a member is none, or a long one."""
+    name = info.filename.removesuffix(".npy")
+    wanted = InputError(f"{path}: its {name} is no word; store one of {', '.join(WORDS[name])}")
+    if info.file_size > _LONGEST_WORD or info.flag_bits & 1:
+        raise wanted
+    with archive.open(info) as stream:
+        try:
+            found = np.lib.format.read_array(stream, allow_pickle=False)
+        except Exception:  # the header is a Python literal, and its reader raises nearly anything
+            raise wanted from None
+    if found.dtype.kind not in "US" or found.size != 1:
+        raise wanted
+    word = found.item()
+    return word.decode("utf-8", "replace") if isinstance(word, bytes) else str(word)
 
 
 class Tif(Format):
