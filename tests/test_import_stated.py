@@ -220,6 +220,11 @@ def test_a_data_set_that_is_not_there(tmp_path: Path, name: str, says: str) -> N
     assert says in refusal(grouped(tmp_path / "a.h5"), Said(dataset=name))
 
 
+def test_frames_that_last_too_long(tmp_path: Path) -> None:
+    says = "30 frames with a period of 1e+18 s last more than 1e+18 s; correct --frame-period"
+    assert says in refusal(stated(tmp_path, "h5", BITS), Said(frame_period=1e18))
+
+
 # --- one recording, one capture -----------------------------------------------------------------------------------
 
 

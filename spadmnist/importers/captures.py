@@ -407,6 +407,11 @@ def _described(
         if time > period * (1 + 1e-12):
             times = units.show(time, "s"), units.show(period, "s")
             raise InputError(f"{path}: a frame of {times[0]} does not fit into the frame period of {times[1]}")
+        if frames * period > units.LONGEST:
+            raise InputError(
+                f"{path}: {frames:,} frames with a period of {units.show(period, 's')} last more than "
+                f"{units.LONGEST:g} s; correct --frame-period"
+            )
         clock = Conditions(frames * period, frames, time, period, lit.wavelength, bits, counting, lit.scene)
     return Capture(safe_name(path.stem, [one.id for one in before]), modality, lit, clock)
 
