@@ -215,23 +215,40 @@ def _lzf_size(raw):  # type: ignore[no-untyped-def]
 
 
 def attribute(nodes: tuple[Any, ...], name: str, path: Path) -> Any:
-    """A number or text from the first of some nodes that has it; None where none has."""
+    """A number or text that some nodes have, the file and a data set of it; None where none has.
+
+    Raises InputError where it is no such thing, and where they say it differently.
+    """
+    found = [(node, _value(node, name, path)) for node in nodes if name in node.attrs]
+    for node, value in found[1:]:
+        first, there = found[0]
+        if value != there:
+            ends = [f"{there!r:.40} ({_called(first)})", f"{value!r:.40} ({_called(node)})"]
+            raise InputError(f"{path}: says its {name} twice, {' and '.join(sorted(ends))}; keep one of them")
+    return found[0][1] if found else None
+
+
+def _called(node: Any) -> str:
+    """What a message calls the file, or something in it."""
+    name = str(node.name or "").strip("/")
+    return visible(name)[:60] if name else "the file"
+
+
+def _value(node: Any, name: str, path: Path) -> Any:
+    """An attribute that is there, a number or text."""
     import h5py
 
-    for node in nodes:
-        if name not in node.attrs:
-            continue
-        description = node.attrs.get_id(name)
-        text = description.dtype.kind == "S" or h5py.check_string_dtype(description.dtype) is not None
-        if math.prod(description.shape) != 1 or not (text or description.dtype.kind in "iuf"):
-            raise InputError(f"{path}: the attribute {name} is not one number or one text; write it as that")
-        if text and description.dtype.kind == "O":
-            _check_heaps(path)
-        value = np.asarray(node.attrs[name]).ravel()[0]
-        if text:
-            return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-        return value.item()
-    return None
+    description = node.attrs.get_id(name)
+    text = description.dtype.kind == "S" or h5py.check_string_dtype(description.dtype) is not None
+    empty = description.get_space().get_simple_extent_type() == h5py.h5s.NULL
+    if empty or math.prod(description.shape) != 1 or not (text or description.dtype.kind in "iuf"):
+        raise InputError(f"{path}: the attribute {name} is not one number or one text; write it as that")
+    if text and description.dtype.kind == "O":
+        _check_heaps(path)
+    value = np.asarray(node.attrs[name]).ravel()[0]
+    if text:
+        return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    return value.item()
 
 
 def _check_heaps(path: Path) -> None:
@@ -266,7 +283,8 @@ def examine(path: Path, capture: Capture, shape: tuple[int, int]) -> Capture:
 
 
 def _found(file: Any, capture: Capture, shape: tuple[int, int], path: Path) -> _Found:
-    said = attribute((file,), "modality", path)
+    nodes = _nodes(file, "time" if capture.modality == "tr" else "frames")
+    said = attribute(nodes, "modality", path)
     if said is not None and said != capture.modality:
         raise InputError(
             f"{path}: says that it is {str(said)[:40]!r}, but the capture {capture.id} is {capture.modality!r}; "
@@ -279,17 +297,17 @@ def _found(file: Any, capture: Capture, shape: tuple[int, int], path: Path) -> _
             f"right file there, or, where the capture was renamed, take out the file's attribute {OWNER}"
         )
     if capture.modality == "tr":
-        return _found_events(file, capture, math.prod(shape), path)
+        return _found_events(file, nodes, capture, path)
     frames = _data_set(file, "frames", path)
     if frames.ndim != 3:
         raise InputError(f"{path}: frames has {frames.ndim} axes, {frames.shape}; it needs (frames, rows, columns)")
     if capture.modality == "counts":
-        found = _found_counts(file, frames, capture, path)
+        found = _found_counts(nodes, frames, capture, path)
     elif capture.modality == "str":
-        tick = _tick((file, frames), capture.conditions.frame_time, path)
+        tick = _tick(nodes, capture.conditions.frame_time, path)
         found = _Found(capture, tick)
     else:
-        found = _Found(capture, None, _is_packed(file, frames, shape[1], path))
+        found = _Found(capture, None, _is_packed(nodes, frames, shape[1], path))
     conditions = found.capture.conditions
     count = conditions.count_frames if capture.modality == "counts" else conditions.frames
     wanted = (count, shape[0], -(-shape[1] // 8) if found.packed else shape[1])
@@ -314,7 +332,14 @@ def _by(shape: tuple[int, ...]) -> str:
     return " x ".join(str(n) for n in shape)
 
 
-def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Found:
+def _nodes(file: Any, name: str) -> tuple[Any, ...]:
+    """What says how a capture was recorded: the file, and its data set of that name where there is one."""
+    import h5py
+
+    return (file, file[name]) if isinstance(file.get(name, getlink=True), h5py.HardLink) else (file,)
+
+
+def _found_events(file: Any, nodes: tuple[Any, ...], capture: Capture, path: Path) -> _Found:
     time, pixel = (_data_set(file, name, path, LARGEST_CHUNK_OF_STAMPS) for name in ("time", "pixel"))
     for name, found in (("time", time), ("pixel", pixel)):
         if found.ndim != 1 or found.dtype.kind != "u":
@@ -323,7 +348,7 @@ def _found_events(file: Any, capture: Capture, pixels: int, path: Path) -> _Foun
         raise InputError(
             f"{path}: time has {len(time):,} entries and pixel {len(pixel):,}; both need one for each detection"
         )
-    tick = _tick((file, time), capture.conditions.exposure, path)
+    tick = _tick(nodes, capture.conditions.exposure, path)
     check_number(path, len(time), stamps_type(path, capture.conditions.exposure, tick))
     check_stored(time, "time", path)
     check_stored(pixel, "pixel", path)
@@ -355,8 +380,8 @@ def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
         raise InputError(f"{path}: lacks the attribute tick, the length of a tick in s; write for example tick = 1e-10")
     if isinstance(value, str) or not units.SHORTEST <= value < math.inf:
         raise InputError(
-            f"{path}: the attribute tick is {value!r}; it must be a number of seconds, more than 0 "
-            f"({units.SHORTEST:g} s)"
+            f"{path}: the attribute tick is {value!r:.40}; it must be a number of seconds, more than 0 "
+            f"({units.SHORTEST:g} s), 1e-9 for example"
         )
     if value > end:
         raise InputError(
@@ -367,8 +392,8 @@ def _tick(nodes: tuple[Any, ...], end: float, path: Path) -> float:
     return float(value)
 
 
-def _is_packed(file: Any, frames: Any, columns: int, path: Path) -> bool:
-    width = attribute((frames, file), "width", path)
+def _is_packed(nodes: tuple[Any, ...], frames: Any, columns: int, path: Path) -> bool:
+    width = attribute(nodes, "width", path)
     if width is None:
         if frames.shape[2] == columns:
             return False
@@ -383,11 +408,11 @@ def _is_packed(file: Any, frames: Any, columns: int, path: Path) -> bool:
     return True
 
 
-def _found_counts(file: Any, frames: Any, capture: Capture, path: Path) -> _Found:
+def _found_counts(nodes: tuple[Any, ...], frames: Any, capture: Capture, path: Path) -> _Found:
     """Count frames: a capture states the clock of the binary frames that they sum, or that of the count frames."""
     c = capture.conditions
-    bits = attribute((file, frames), "bits", path)
-    counting = attribute((file, frames), "counting", path) or "frames"
+    bits = attribute(nodes, "bits", path)
+    counting = attribute(nodes, "counting", path) or "frames"
     if bits is None:
         raise InputError(f"{path}: lacks the attribute bits, of a count; write for example bits = 8")
     if isinstance(bits, (str, float)) or not 1 <= bits <= _MOST_BITS:

@@ -87,6 +87,15 @@ def opened(path: str | os.PathLike[str]) -> IO[bytes]:
 _HANDED_OVER = re.compile(r"/dev/stdin|/dev/fd/[0-9]+|/proc/self/fd/[0-9]+")
 
 
+def identity(path: str | os.PathLike[str]) -> tuple[Any, ...]:
+    """What two paths have in common where they lead to one file: by links of any kind, or written in another way."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):
+        return (os.path.abspath(path),)
+    return status.st_dev, status.st_ino
+
+
 def check_outside(place: str | os.PathLike[str]) -> None:
     """Raise SpadError where a place lies inside a dataset, finished or not: that holds its own files alone."""
     for folder in Path(os.path.realpath(place)).parents:

@@ -159,6 +159,10 @@ def _value(node: Any, path: Path_, document: Document, problems: list[str], seen
     if len(path) > _DEEPEST:
         problems.append(f"{document.name}:{line}: is nested more than {_DEEPEST} deep")
         return None
+    usual = f"tag:yaml.org,2002:{'map' if isinstance(node, yaml.MappingNode) else 'seq'}"
+    if isinstance(node, yaml.CollectionNode) and node.tag != usual:
+        problems.append(f"{document.place(path)}: the tag {node.tag:.60} is not allowed; write plain YAML")
+        return None
     if isinstance(node, yaml.MappingNode):
         out: dict[Any, Any] = {}
         first: dict[Any, int] = {}

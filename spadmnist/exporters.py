@@ -144,7 +144,7 @@ class PlainHdf5(Target):
 
 
 class Npz(Target):
-    """NumPy archive: time and pixel, or frames (QIS packed along columns, the high bit first), and numbers."""
+    """NumPy archive: time and pixel, or frames (QIS packed along columns, the high bit first), modality and numbers."""
 
     name = "npz"
     suffix = ".npz"
@@ -154,7 +154,7 @@ class Npz(Target):
     def put(cls, recording: Recording, file: IO[bytes]) -> None:
         """Stored without a date, so that the same capture gives the same bytes."""
         with zipfile.ZipFile(file, "w") as archive:
-            for name, value in facts(recording).items():
+            for name, value in {"modality": recording.modality, **facts(recording)}.items():
                 cls._member(archive, name, np.asarray(value))
             if recording.events is not None:
                 events, ticks, _ = _stamped(recording)

@@ -140,7 +140,7 @@ class Said:
         choices=("big", "little"),
     )
     dataset: str | None = _option(
-        "Data set of the frames.  [default: frames]", modalities=_FRAMES, own=PLAIN_HDF5, metavar="PATH"
+        "Data set of the frames, or group that holds time and pixel.  [default: frames]", own=PLAIN_HDF5, metavar="PATH"
     )
     tdc: Path | None = _option(
         "Ends of the converter's codes, ps.", modalities=_TIMES, own=LINOSPAD2, path=True, metavar="FILE.csv"

@@ -30,13 +30,15 @@ def written(unit: str, signed: bool = True) -> dict[str, Any]:
 class Amount:
     """For `Annotated`: a quantity whose SI unit is `unit`, more than 0 or, with `zero`, at least 0; at most `most`.
 
-    within: the range of a quantity of which others are one in another unit, mistaken.
+    least: the least number above 0 that is meant. within: the range of a quantity of which others are one in another
+    unit, mistaken.
     """
 
     unit: str
     zero: bool = False
     most: float = math.inf
     within: tuple[float, float] | None = None
+    least: float = 0.0
 
     def read(self, raw: object) -> units.Quantity:
         value = units.parse(raw, self.unit)
@@ -44,6 +46,8 @@ class Amount:
             upper = f" and at most {units.show(self.most, self.unit)}" if self.most < math.inf else ""
             upper = f" and at most {self.most:g} ({100 * self.most:g} %)" if upper and not self.unit else upper
             raise ValueError(f"{value} is not possible; it must be {'at least' if self.zero else 'more than'} 0{upper}")
+        if 0 < value < self.least:
+            raise ValueError(f"{value} is not possible; it must be at least {self.least:g} {self.unit}".rstrip())
         if self.within is not None and not self.within[0] <= value <= self.within[1]:
             low, high = (units.show(end, self.unit) for end in self.within)
             raise ValueError(f"{value} is no light; its wavelength is {low} to {high}, 500 nm for example")
@@ -56,7 +60,7 @@ class Amount:
         return written(self.unit, signed=False)
 
 
-Time = Annotated[units.Quantity, Amount("s")]
+Time = Annotated[units.Quantity, Amount("s", most=units.LONGEST, least=units.SHORTEST)]
 Wavelength = Annotated[units.Quantity, Amount("m", within=units.WAVELENGTHS)]
 Area = Annotated[units.Quantity, Amount("m^2", most=units.LARGEST_PIXEL)]
 Lux = Annotated[units.Quantity, Amount("lux")]

@@ -147,6 +147,18 @@ def test_a_tag_is_refused(tag: str) -> None:
     assert problem.startswith("f.yaml:2: ") and "tag" in problem and tag.strip("!") in problem
 
 
+@pytest.mark.parametrize("tag", ["!!python/object/new:os.system", "!own", "!!set", "!!omap", "!!str"])
+@pytest.mark.parametrize("text", ["{c: 1}", "[1, 2]", "\n  c: 1", "\n  - 1"])
+def test_a_tag_of_a_group_or_a_list_is_refused(tag: str, text: str) -> None:
+    (problem,) = problems(f"a: 1\nb: {tag} {text}\n")
+    assert problem.startswith("f.yaml:2: b: the tag ") and tag.strip("!") in problem
+    assert "the tag" in problems(f"{tag}\na: 1\n")[0]
+
+
+def test_the_usual_tags_of_groups_and_lists_are_fine() -> None:
+    assert document.parse("!!map {a: !!seq [1], b: !!map {c: 2}}", "f.yaml").value == {"a": [1], "b": {"c": 2}}
+
+
 def test_a_tag_by_another_name_is_refused() -> None:
     assert "tag" in problems("%TAG ! tag:yaml.org,2002:\n---\na: !python/name:os.system x\n")[0]
 

@@ -642,10 +642,31 @@ def test_tiff_that_shows_0_as_white(tmp_path: Path) -> None:
     assert any("its pages show 0 as white" in note for note in made.notes) and np.array_equal(frames(made), bits())
 
 
+def test_tiff_of_ome_with_one_axis(tmp_path: Path) -> None:
+    array = bits().astype(np.uint8) * 255
+    for axes in ("TYX", "ZYX"):
+        (tmp_path / axes).mkdir()
+        path = tif(tmp_path / axes / "a.ome.tif", array, metadata={"axes": axes})
+        assert np.array_equal(frames(run(path, CLOCK)), bits())
+
+
 def test_tiff_is_refused(tmp_path: Path) -> None:
+    tifffile = pytest.importorskip("tifffile")
     channels = np.zeros((3, 2, 4, 5), np.uint8)
     several = tif(tmp_path / "a.tif", channels, imagej=True, metadata={"axes": "TCYX"})
     assert "has 2 channels (ImageJ), one after the other" in refusal(several, CLOCK)
+    slices = tif(tmp_path / "d.tif", channels, imagej=True, metadata={"axes": "TZYX"})
+    assert "has 2 slices (ImageJ), one after the other" in refusal(slices, CLOCK)
+    several = tif(tmp_path / "a.ome.tif", channels, metadata={"axes": "TCYX"})
+    assert "has 2 channels (OME), one after the other" in refusal(several, CLOCK)
+    with tifffile.TiffWriter(tmp_path / "e.ome.tif") as file:
+        for _ in range(2):
+            file.write(channels[:, 0], photometric="minisblack", metadata={"axes": "TYX"})
+    assert "has 2 images (OME), one after the other" in refusal(tmp_path / "e.ome.tif", CLOCK)
+    several = tif(tmp_path / "f.tif", channels)
+    assert "has 3 of axis 0 and 2 of axis 1 (tifffile), one after the other" in refusal(several, CLOCK)
+    several = tif(tmp_path / "g.tif", channels[0], metadata={"axes": "CYX"})
+    assert "has 2 channels (tifffile), one after the other" in refusal(several, CLOCK)
     colour = tif(tmp_path / "b.tif", np.zeros((3, 4, 5, 3), np.uint8), photometric="rgb")
     assert "store a page of whole numbers" in refusal(colour, CLOCK)
     from PIL import Image

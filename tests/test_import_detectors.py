@@ -130,6 +130,30 @@ _OTHER_TICKS = {
     "photon_data1/detectors": [1],
 }
 REFUSED: dict[str, tuple[Photons, str]] = {
+    "a number of pixels beyond all": (
+        Photons([([1, 2], [0, 1])], num_pixels=10**15),
+        "setup/num_pixels says 1e+15; it is a whole number from 1 to 16,777,216",
+    ),
+    "a number of pixels that is none": (
+        Photons([([1, 2], [0, 1])], more={"setup/num_pixels": np.nan}),
+        "setup/num_pixels says nan; it is a whole number",
+    ),
+    "a number of pixels without end": (
+        Photons([([1, 2], [0, 1])], more={"setup/num_pixels": np.inf}),
+        "setup/num_pixels says inf; it is a whole number",
+    ),
+    "more pixels than a row may have": (
+        Photons([([1, 2], [0, 1])], num_pixels=1 << 24),
+        "1 x 16777216 pixels are more than the 16,777,216, and 100,000 in a row",
+    ),
+    "an identity below 0": (
+        Photons([([1, 2], [0, 1])], ids=[0, 1, -5]),
+        "setup/detectors/id names a detector -5; their numbers are 0 to 16777215: correct the file",
+    ),
+    "an identity beyond all": (
+        Photons([([1, 2], [0, 1])], ids=[0, 1, 1 << 40]),
+        f"setup/detectors/id names a detector {1 << 40}; their numbers are 0 to 16777215",
+    ),
     "fewer pixels than detectors": (
         Photons([([1, 2, 3], [0, 1, 65])], num_pixels=2),
         "setup/num_pixels says 2 pixels, but detections are of 3 detectors (0, 1, 65); name those that are pixels with",

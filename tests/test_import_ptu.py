@@ -354,6 +354,13 @@ def test_more_records_than_there_are(tmp_path: Path) -> None:
         )
 
 
+def test_what_is_left_of_a_file_cut_short(tmp_path: Path) -> None:
+    """The number to write into the header is said, and with it the rest is read."""
+    text = refusal(ptu(tmp_path / "a.ptu", T2_RECORDS, declared=5), Said())
+    assert "it was cut short" in text and "write 2 into TTResult_NumberOfRecords of its header" in text
+    assert back(run(ptu(tmp_path / "a.ptu", T2_RECORDS, declared=2), Said())).totals.sum() > 0
+
+
 def test_overflows_beyond_64_bits(tmp_path: Path) -> None:
     records = [t2(63, (1 << 25) - 1, True)] * (1 << 14) + [t2(0, 1)]
     assert "goes round 549,755,797,504 times" in refusal(ptu(tmp_path / "a.ptu", records), Said())

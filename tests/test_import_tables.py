@@ -169,6 +169,43 @@ def test_the_line_that_is_wrong(tmp_path: Path, size: int, blank: str, monkeypat
     assert f"a.csv:{line}: 0 at -1 ps" in refusal(tmp_path / "a.csv")
 
 
+@pytest.mark.parametrize(
+    ("head", "cells", "says"),
+    [
+        ("pixel,time (ps)", "0,abc", "could not convert 'abc' to a number; a line is 3,1250"),
+        ("pixel,time (ps)", "0,", "could not convert '' to a number; a line is 3,1250"),
+        ("pixel,time (ps)", '0,"5"', "could not convert '\"5\"' to a number; a line is 3,1250; take the quotes out"),
+        ("pixel,time (ps)", "0,1_0", "could not convert '1_0' to a number"),
+        (
+            "pixel\ttime (ps)",
+            "0\t5,5",
+            "could not convert '5,5' to a number; a line is 3,1250; write a decimal point, or separate the",
+        ),
+        (
+            "pixel,time (ps)",
+            "0,5,5",
+            "has 3 columns, and the lines before 2; a line is 3,1250; numbers may have a deci",
+        ),
+        ("time (ps)", "x", "could not convert 'x' to a number; a line is 1250"),
+    ],
+)
+def test_the_line_of_a_cell_that_is_no_number(tmp_path: Path, head: str, cells: str, says: str) -> None:
+    right = "7" if head.startswith("time") else head.replace("pixel", "0").replace("time (ps)", "7")
+    (tmp_path / "a.csv").write_text(f"{head}\n{right}\n\n{right}\n{cells}\n{right}\n")
+    assert f"a.csv:5: {says}" in refusal(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("number", ["1e2000000", "9e999999999999999999999"])
+def test_exponents_beyond_decimals(tmp_path: Path, number: str) -> None:
+    (tmp_path / "a.csv").write_text(f"pixel,time (ps)\n0,3\n0,{number}\n")
+    assert "a.csv:3: 0 at inf ps is no pixel (0, 1, ...) and a time" in refusal(tmp_path / "a.csv")
+
+
+def test_a_time_too_small_for_decimals_is_0(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("pixel,time (s)\n0,1e-999999999999999999999999\n0,8000\n")
+    assert taken(run(tmp_path / "a.csv", Said(exposure=1e4))) == [(0, 0), (0, 8 * 10**15)]
+
+
 # --- x and y ------------------------------------------------------------------------------------------------------
 
 

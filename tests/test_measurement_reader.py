@@ -239,6 +239,9 @@ HERE = "{id: a, mean: 3, modality: MODALITY, light: {kind: KIND}, CLOCK}"
         ("tr", "dark, own_uncertainty: 101 %", "exposure: 1 ms",
          ".light.own_uncertainty: 101 % is not possible; it must be at least 0 and at most 1 (100 %)"),
         ("tr", "dark", "exposure: 1 ms, file: a.h5", ": has both file and mean; keep one"),
+        ("tr", "dark", "exposure: 1e300 s", ".exposure: 1e300 s is not possible; it must be more than 0 and at most"),
+        ("tr", "dark", "exposure: 1e-20 s", ".exposure: 1e-20 s is not possible; it must be at least 1e-18 s"),
+        ("qis", "dark", "frames: 100, frame_time: 1e17 s", ".frames: frames x frame_period is 1e+19 s; it is at most"),
         ("tr", "dark", "exposure: null", ".exposure: None is not a time"),
     ],
 )  # fmt: skip

@@ -52,13 +52,24 @@ FACTS = (
     *("rows", "columns", "exposure", "frame_time", "frame_period", "tick", "bits", "counter", "width"),
     *("wavelength", "irradiance", "lux", "relative_uncertainty", "own_uncertainty"),
 )
+WORDS = {"modality": MODALITIES, "counting": ("frames", "counter")}  # and in these words
 _WHOLE = ("rows", "columns", "bits", "counter", "width")
 _SHARES = ("counter", "relative_uncertainty", "own_uncertainty")  # from 0 to 1
+# what is said of a number that is none of these; else it is a number of seconds
+_WANTED = {
+    "counter": "it is 0 or 1",
+    "wavelength": "it is in m, 500e-9 for 500 nm",
+    "irradiance": f"it is a number of W/m^2 from {SHORTEST:g} to {LONGEST:g}",
+    "lux": f"it is a number of lux from {SHORTEST:g} to {LONGEST:g}",
+    **dict.fromkeys(("relative_uncertainty", "own_uncertainty"), "it is a number from 0 to 1, 0.05 for 5 %"),
+    **dict.fromkeys(("rows", "columns", "bits", "width"), "it is a whole number, 1 or more"),
+}
+_SECONDS = f"it is a number of seconds from {SHORTEST:g} to {LONGEST:g}, 1e-9 for example"
 
 
 def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
-    """What a file says of itself (`get` by name, None where it does not), if that is possible."""
-    found = {}
+    """What a file says of itself (`get` by name, None where not), if that is possible; `counter` as `counting`."""
+    found: dict[str, Any] = {}
     for name in FACTS:
         value = get(name)
         if value is None:
@@ -66,32 +77,33 @@ def facts(path: Path, get: Callable[[str], Any]) -> dict[str, Any]:
         low, high = (0, 1) if name in _SHARES else WAVELENGTHS if name == "wavelength" else (SHORTEST, LONGEST)
         fine = not isinstance(value, str) and low <= value <= high
         if not fine or (name in _WHOLE and value != int(value)):
-            unit = "; it is in m, 500e-9 for 500 nm" if name == "wavelength" else ""
+            wanted = _WANTED.get(name, _SECONDS)
             raise InputError(
-                f"{path}: says that its {name} is {_shown(value)}, which is not possible{unit}; correct it"
+                f"{path}: says that its {name} is {_shown(value)}, which is not possible; {wanted}; correct it"
             )
         found[name] = int(value) if name in _WHOLE else float(value)
+    if "counter" in found:
+        found["counting"] = "counter" if found.pop("counter") else "frames"
     return found
 
 
-def said_in_words(path: Path, get: Callable[[str], Any], detections: bool, said: Said) -> dict[str, int]:
-    """Further facts: the `counter` of a file that says how it counts. get: by name, None where the file does not say.
+def in_words(path: Path, get: Callable[[str], Any], detections: bool, known: Mapping[str, Any]) -> dict[str, str]:
+    """Further facts: the `WORDS` that a file says of itself. get: by name, None where it does not; known: its `facts`.
 
-    Raises InputError for another word, and where modality contradicts what is there or what the user says.
+    Raises InputError for another word, and where the file says otherwise elsewhere, or holds something else.
     """
-    modality, counting = get("modality"), get("counting")
-    if modality is not None and modality not in MODALITIES:
-        raise InputError(f"{path}: says that its modality is {_shown(modality)}; it is one of {', '.join(MODALITIES)}")
-    if counting is not None and counting not in ("frames", "counter"):
-        raise InputError(f"{path}: says that its counting is {_shown(counting)}; it is frames or counter")
+    found = {name: get(name) for name in WORDS if get(name) is not None}
+    for name, word in found.items():
+        if word not in (allowed := WORDS[name]):
+            listed = f"{'one of ' * (len(allowed) > 2)}{' or '.join([', '.join(allowed[:-1]), allowed[-1]])}"
+            raise InputError(f"{path}: says that its {name} is {_shown(word)}; it is {listed}")
+        if known.get(name, word) != word:
+            raise InputError(f"{path}: says that its {name} is {word}, and that it is {known[name]}; keep one of them")
+    modality = found.get("modality")
     if modality is not None and (modality == "tr") != detections:
         held = "time stamps (tr)" if detections else "frames"
         raise InputError(f"{path}: says that its modality is {modality}, but holds {held}; correct it")
-    if modality is not None and said.modality not in (None, modality):
-        raise InputError(f"{path}: says that its modality is {modality}; leave out --modality")
-    if modality is not None and modality != "counts" and said.bits is not None:
-        raise InputError(f"{path}: says that its modality is {modality}, which has no --bits; leave it out")
-    return {"counter": int(counting == "counter")} if counting is not None else {}
+    return found
 
 
 def _shown(value: Any) -> str:
@@ -133,8 +145,8 @@ class Found:
     pixels: the channels that are pixels, in the pixels' order, silent ones too; None where the file does not say.
     names: channels that the file does not call by their number. bits: each number of the frames is a bit, and they are
     `packed` where eight columns are a byte; arranged: the kind of file says which axis is which. facts: what the file
-    says of itself, see `FACTS`; sources: where, by the name of the fact. notes: what is to be known of it; left_out:
-    what of the file is no detection of a pixel.
+    says of itself, see `FACTS` and `WORDS`; sources: where, by the name of the fact. notes: what is to be known of it;
+    left_out: what of the file is no detection of a pixel.
     """
 
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -290,16 +302,17 @@ def is_packed(path: Path, shape: tuple[int, ...], known: Mapping[str, Any], said
     return said.packed or (width is not None and (shape[2] != width or width == 1))
 
 
-def holds_detections(path: Path, names: Collection[str], frames: bool, said: Said) -> bool:
+def holds_detections(path: Path, names: Collection[str], frames: bool, modality: str | None) -> bool:
     """Does a file of arrays hold detections, rather than frames? names: of the arrays; frames: are there frames?
+    modality: as the user says it, else the file; None where neither does.
 
     Raises InputError where it holds both and nobody says which are meant.
     """
     if not {"time", "pixel"} <= set(names):
         return "time" in names and not frames
-    if frames and said.modality is None:
+    if frames and modality is None:
         raise InputError(f"{path}: holds detections (time, pixel) and frames; say with --modality which are meant")
-    return not frames or said.modality == "tr"
+    return not frames or modality == "tr"
 
 
 def damaged(path: Path, error: Exception) -> InputError:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from .. import look, measurement, units
+from .. import disk, look, measurement, units
 from ..effects import Conditions
 from ..errors import InputError, SpadError
 from ..factory import Progress
@@ -143,6 +143,7 @@ def import_files(
     planned = plan.read(out)
     if planned is None and ids:
         raise SpadError(f"--capture: {out} is no plan with captures that are missing; leave out --capture")
+    _check_twice(files)
     progress = progress or Progress()
     ones = _matched(files, said, planned, lights, name, ids)
     _check_options([(one.path, one.kind, one.kind.modalities, None) for one in ones], said)
@@ -251,6 +252,14 @@ def _matched(
     ]
 
 
+def _check_twice(files: Sequence[Path]) -> None:
+    """Raise SpadError where two of the files are one: a recording is one capture."""
+    first: dict[Any, int] = {}
+    for i, path in enumerate(files):
+        if (at := first.setdefault(disk.identity(path), i)) != i:
+            raise SpadError(f"{path}: is the same file as {files[at]}, and a recording is one capture; name it once")
+
+
 def _recordings(
     ones: Sequence[_One],
     said: Said,
@@ -353,8 +362,8 @@ def _described(
     for key in ("bits",) if said.channels is not None else ("rows", "columns", "bits"):
         if getattr(said, key) is not None and found.facts.get(key, getattr(said, key)) != getattr(said, key):
             raise InputError(f"{path}: says that its {key} are {found.facts[key]}; leave out {word(key)}")
-    if said.counting == "frames" and found.facts.get("counter"):
-        raise InputError(f"{path}: says that its counts are those of a counter; leave out --counting")
+    if said.counting is not None and (there := found.facts.get("counting", said.counting)) != said.counting:
+        raise InputError(f"{path}: says that its counting is {there}; leave out --counting")
     for key in ("exposure", "frame_time", "frame_period"):
         if key in told and not math.isclose(found.facts.get(key, told[key]), told[key], rel_tol=1e-9):
             there = units.show(found.facts[key], "s", 9)
@@ -380,8 +389,7 @@ def _described(
         clock = Conditions(exposure, 1, exposure, exposure, lit.wavelength, scene=lit.scene)
     else:
         bits = known["bits"] if modality == "counts" else 0
-        counter = said.counting == "counter" if said.counting else known.get("counter") == 1
-        counting = "counter" if counter and bits else "frames"
+        counting = (said.counting or known.get("counting", "frames")) if bits else "frames"
         if not 0 <= bits <= 16:
             raise InputError(f"{path}: counts of {bits} bits are not possible; give --bits from 1 to 16")
         held, each = found.frames.shape[0], 1 if counting == "counter" or not bits else (1 << bits) - 1
@@ -399,6 +407,11 @@ def _described(
         if time > period * (1 + 1e-12):
             times = units.show(time, "s"), units.show(period, "s")
             raise InputError(f"{path}: a frame of {times[0]} does not fit into the frame period of {times[1]}")
+        if frames * period > units.LONGEST:
+            raise InputError(
+                f"{path}: {frames:,} frames with a period of {units.show(period, 's')} last more than "
+                f"{units.LONGEST:g} s; correct --frame-period"
+            )
         clock = Conditions(frames * period, frames, time, period, lit.wavelength, bits, counting, lit.scene)
     return Capture(safe_name(path.stem, [one.id for one in before]), modality, lit, clock)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import lzma
 import math
+import re
 import weakref
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ from . import (
     FACTS,
     GZIP,
     LARGEST_PIECE,
+    WORDS,
     Format,
     Found,
     Said,
@@ -31,6 +35,7 @@ from . import (
     frames_in_file,
     heard,
     holds_detections,
+    in_words,
     is_packed,
     library,
     one_axis,
@@ -43,6 +48,8 @@ from .stacks import arranged, cut
 _COUNTED = 1 << 20  # bytes that are unpacked at a time, to be counted
 _LZMA_MEMORY = 1 << 27  # bytes that LZMA may take to unpack: its largest usual dictionary has half of them
 _FRAMES = tuple(name for name in MODALITIES if name != "tr")
+_ARRAYS = ("time", "pixel", "frames")
+_LONGEST_WORD = 4096  # bytes of a member that is a word, its header included
 
 
 class Npy(Format):
@@ -89,7 +96,8 @@ class Npy(Format):
 
 
 class Npz(Format):
-    """A NumPy archive of time and pixel, or of frames, and of numbers by the names of `FACTS`, as `export` writes it.
+    """A NumPy archive of time and pixel, or of frames, and of what it says of itself by the names of `FACTS` and
+    `WORDS`, as `export` writes it.
 
     It is read whole: for a large stack HDF5 or .npy is better.
     """
@@ -105,15 +113,16 @@ class Npz(Format):
             with zipfile.ZipFile(path) as archive:
                 held = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
                 size, parts = path.stat().st_size, {}
-                declared = sum(held[name].file_size for name in ("time", "pixel", "frames") if name in held)
+                declared = sum(held[name].file_size for name in _ARRAYS if name in held)
                 if declared > LARGEST_PIECE:
                     raise InputError(
                         f"{path}: unpacks to {declared:,} bytes, more than the {LARGEST_PIECE:,} that are read whole; "
                         "store HDF5 or .npy, which are read piece by piece"
                     )
-                for name in (*FACTS, "time", "pixel", "frames"):
+                for name in (*FACTS, *_ARRAYS):
                     if name in held:
                         parts[name] = image_files.read_member(archive, held[name], size, f"{path}: {name}")
+                words = {name: _word(archive, held[name], path) for name in WORDS if name in held}
         except (zipfile.BadZipFile, OSError, RuntimeError, ValueError, NotImplementedError) as error:
             raise damaged(path, error) from None
         for name in set(FACTS) & set(parts):
@@ -123,20 +132,45 @@ class Npz(Format):
         plain = {name: part for name, part in parts.items() if name not in FACTS and part.dtype.kind in "iubf"}
         sources = dict.fromkeys(known, "the file")
         stacked = "frames" in plain and plain["frames"].ndim == 3
-        if stacked and not holds_detections(path, plain, stacked, said):
+        others = sorted(set(held) - {*FACTS, *WORDS, *_ARRAYS})
+        row = ", ".join(visible(name)[:40] for name in others[:8]) + ", ..." * (len(others) > 8)
+        notes = (
+            f"holds {row} as well, which was not read; what is read besides the data is {', '.join((*FACTS, *WORDS))}",
+        ) * bool(others)
+        if stacked and not holds_detections(path, plain, stacked, said.modality or words.get("modality")):
             frames = plain["frames"]
+            known |= in_words(path, words.get, False, known)
             packed = is_packed(path, frames.shape, known, said)
             letters = "MHW" if packed else said.axes or "MHW"
             stack = arranged(frames.shape, frames.dtype, letters, lambda a, b: frames[cut(letters, a, b)])
-            return Found(known, frames=stack, bits=frames.dtype.kind == "b", packed=packed, sources=sources)
+            bits = frames.dtype.kind == "b"
+            return Found(known, frames=stack, bits=bits, packed=packed, sources=sources, notes=notes)
         if {"time", "pixel"} <= set(plain):
             refuse_fine_times(path, held)
+            known |= in_words(path, words.get, True, known)
             time, pixel = (whole(one_axis(plain[name], name, path), name, path) for name in ("time", "pixel"))
-            return Found(known, Detections.of(path, pixel, time), sources=sources)
+            return Found(known, Detections.of(path, pixel, time), sources=sources, notes=notes)
         there = ", ".join(visible(name) for name in sorted(held)[:8])[:200]
         raise InputError(
             f"{path}: holds {there}; it needs whole numbers time and pixel, or frames (frames, rows, columns)"
         )
+
+
+def _word(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path) -> str:
+    """A text of an archive. Raises InputError where a member is none, or a long one."""
+    name = info.filename.removesuffix(".npy")
+    wanted = InputError(f"{path}: its {name} is no word; store one of {', '.join(WORDS[name])}")
+    if info.file_size > _LONGEST_WORD or info.flag_bits & 1:
+        raise wanted
+    with archive.open(info) as stream:
+        try:
+            found = np.lib.format.read_array(stream, allow_pickle=False)
+        except Exception:  # the header is a Python literal, and its reader raises nearly anything
+            raise wanted from None
+    if found.dtype.kind not in "US" or found.size != 1:
+        raise wanted
+    word = found.item()
+    return word.decode("utf-8", "replace") if isinstance(word, bytes) else str(word)
 
 
 class Tif(Format):
@@ -160,15 +194,16 @@ class Tif(Format):
                 weakref.finalize(file, file.filehandle.close)
                 first, count = file.pages[0], len(file.pages)
                 shape, dtype = tuple(map(int, first.shape)), first.dtype
-                of_imagej = file.imagej_metadata or {}
-                declared, colours = int(of_imagej.get("images", 1)), int(of_imagej.get("channels", 1))
+                declared, axes = int((file.imagej_metadata or {}).get("images", 1)), _axes(file)
                 white_is_0 = first.photometric == tifffile.PHOTOMETRIC.MINISWHITE
         except Exception as error:  # damaged files make it raise nearly anything
             raise damaged(path, error) from None
-        if colours > 1:
+        several = {name: size for name, size in axes.sizes.items() if size > 1}
+        if len(several) > 1 or "channels" in several:
+            held = " and ".join(f"{size} {name}" for name, size in several.items() if name != "frames")
             raise InputError(
-                f"{path}: has {colours} channels (ImageJ), one after the other; store each by itself, or, where they "
-                "are frames, store it with frames (axes TYX)"
+                f"{path}: has {held} ({axes.of}), one after the other; store each by itself, or, where they are "
+                "frames, store it with frames (axes TYX)"
             )
         if len(shape) != 2 or dtype is None or dtype.kind not in "iubf" or declared > count:
             raise InputError(
@@ -206,6 +241,40 @@ class Tif(Format):
         notes = ("its pages show 0 as white; the numbers are taken as they stand, 0 as no detection",) * white_is_0
         stack = arranged((count, *shape), dtype, letters, get)
         return Found(frames=stack, bits=dtype.kind == "b", packed=said.packed, notes=notes)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """What the pages of a TIFF file are, as its description says: how many of each. of: who wrote the description."""
+
+    of: str = ""
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+
+_LETTERS = {"T": "frames", "C": "channels", "Z": "slices"}  # of axes in a description
+
+
+def _axes(file: Any) -> _Axes:
+    """The axes of an open TIFF file besides rows and columns, by its first page alone: series may lie in other files.
+
+    Raises ValueError for a description that cannot be read.
+    """
+    if of_imagej := file.imagej_metadata:
+        return _Axes("ImageJ", {name: int(of_imagej.get(name, 1)) for name in ("frames", "channels", "slices")})
+    first = file.pages[0]
+    if first.is_ome:
+        images = re.findall(r"<(?:\w+:)?Pixels\s[^>]*>", first.description)
+        sizes = [dict(re.findall(r"""\bSize([TCZ])\s*=\s*["'](\d{1,9})["']""", image)) for image in images]
+        most = {_LETTERS[key]: max((int(one.get(key, 1)) for one in sizes), default=1) for key in "TCZ"}
+        return _Axes("OME", {"images": len(images), **most})
+    described = [text for text in (first.description, first.description1) if text.startswith('{"shape":')]
+    if described:
+        told = json.loads(described[0])
+        shape, letters = told["shape"], str(told.get("axes", ""))
+        letters = letters if len(letters) == len(shape) else "?" * len(shape)
+        outer = list(zip(letters, shape, strict=True))[: -len(first.shape)]
+        return _Axes("tifffile", {_LETTERS.get(one, f"of axis {i}"): int(size) for i, (one, size) in enumerate(outer)})
+    return _Axes()
 
 
 def _check_page(file: Any, page: Any, path: Path) -> None:

@@ -24,9 +24,9 @@ from . import (
     Said,
     facts,
     holds_detections,
+    in_words,
     is_packed,
     refuse_fine_times,
-    said_in_words,
     whole,
 )
 from .detections import Detections, Pieces, check_lengths
@@ -35,8 +35,8 @@ from .stacks import arranged, cut
 _MARK = (HDF5,)
 
 
-def _node(file: Any, name: str, path: Path, group: bool = False) -> Any:
-    """A data set (or group) of an HDF5 file, reached through no link; None where there is none."""
+def _node(file: Any, name: str, path: Path, group: bool | None = False) -> Any:
+    """A data set (or group; with None either) of an HDF5 file, reached through no link; None where there is none."""
     import h5py
 
     node = file
@@ -47,9 +47,10 @@ def _node(file: Any, name: str, path: Path, group: bool = False) -> Any:
         if not isinstance(link, h5py.HardLink):
             raise InputError(f"{path}: {name} is a link to somewhere else, which is not followed; copy the data in")
         node = node[part]
-    if not isinstance(node, h5py.Group if group else h5py.Dataset):
+    is_group = isinstance(node, h5py.Group)
+    if (group is not None and is_group != group) or not isinstance(node, (h5py.Group, h5py.Dataset)):
         raise InputError(f"{path}: {name} is not a {'group' if group else 'data set'}; name another")
-    if not group and (node.is_virtual or node.external):
+    if not is_group and (node.is_virtual or node.external):
         raise InputError(f"{path}: the data of {name} lie in another file, which is not read; copy them in")
     return node
 
@@ -58,12 +59,21 @@ def _data_set(file: Any, name: str, path: Path, axes: int = 1) -> Any:
     """A plain data set of whole numbers that is there as a whole."""
     found = _node(file, name, path)
     if found is None:
-        there = ", ".join(sorted(visible(key)[:40] for key in list(file)[:10])) or "nothing"
-        raise InputError(f"{path}: has no data set {name}; there is {there} (--dataset names one of frames)")
+        inside = name.strip("/").rpartition("/")[0]
+        group = _node(file, inside, path, group=None) if inside else file
+        keys = [] if group is None or hasattr(group, "shape") else list(group)[:10]
+        there = ", ".join(sorted(visible(key)[:40] for key in keys)) or "nothing"
+        raise InputError(
+            f"{path}: has no data set {name}; there is {there} (--dataset names one of frames, or a group of time and "
+            "pixel)"
+        )
     line = axes == 1 and found.ndim == 2 and 1 in found.shape  # MATLAB has no arrays of one axis
     if found.dtype.kind not in "iubf" or (found.ndim != axes and not line):
         what = "(frames, rows, columns)" if axes == 3 else "one axis"
-        raise InputError(f"{path}: {name} is {found.dtype} of the shape {found.shape}; store whole numbers with {what}")
+        stamps = "; of time stamps name the group that holds time and pixel" if axes == 3 and found.ndim == 1 else ""
+        raise InputError(
+            f"{path}: {name} is {found.dtype} of the shape {found.shape}; store whole numbers with {what}{stamps}"
+        )
     made = found.id.get_create_plist()
     if not {made.get_filter(i)[0] for i in range(made.get_nfilters())} <= FILTERS.keys():
         raise InputError(f"{path}: {name} is packed by a filter that HDF5 itself lacks; store it with gzip")
@@ -332,8 +342,15 @@ def _pixels(file: Any, groups: list[str], used: np.ndarray, path: Path) -> tuple
 
 
 def _count(file: Any, path: Path) -> int | None:
-    """What the file says of the number of its pixels."""
-    return None if _node(file, "setup/num_pixels", path) is None else int(_number(file, "setup/num_pixels", path))
+    """What the file says of the number of its pixels. Raises InputError where that is no such number."""
+    if _node(file, "setup/num_pixels", path) is None:
+        return None
+    number = _number(file, "setup/num_pixels", path)
+    if not 1 <= number <= MOST_CHANNELS or number != int(number):
+        raise InputError(
+            f"{path}: setup/num_pixels says {number:.15g}; it is a whole number from 1 to {MOST_CHANNELS:,}: correct it"
+        )
+    return int(number)
 
 
 def _specified(file: Any, groups: list[str], path: Path) -> set[int]:
@@ -357,7 +374,12 @@ def _listed(file: Any, name: str, path: Path) -> set[int]:
     found = _node(file, name, path)
     if found is None or found.dtype.kind not in "iu" or found.ndim > 1 or found.size > _MOST_DETECTORS:
         raise InputError(f"{path}: {name} is no list of detectors; write their numbers there")
-    return set(map(int, np.asarray(found[()]).ravel()))
+    numbers = set(map(int, np.asarray(found[()]).ravel()))
+    for wrong in (end for end in (min(numbers, default=0), max(numbers, default=0)) if not 0 <= end < MOST_CHANNELS):
+        raise InputError(
+            f"{path}: {name} names a detector {wrong}; their numbers are 0 to {MOST_CHANNELS - 1}: correct the file"
+        )
+    return numbers
 
 
 _MOST_DETECTORS = 1 << 20
@@ -389,8 +411,9 @@ def _has_stack(file: Any) -> bool:
 
 
 class PlainHdf5(Format):
-    """Plain HDF5: the data sets time and pixel, or frames (--dataset names another), as a measurement stores them.
+    """Plain HDF5: the data sets time and pixel, or frames, as a measurement stores them.
 
+    With --dataset it is another data set of frames, or those of a group.
     In a file of MATLAB (7.3) the axes are those that MATLAB shows, and a stack is (rows, columns, frames) unless --axes
     says otherwise.
     """
@@ -402,18 +425,24 @@ class PlainHdf5(Format):
     @classmethod
     def read(cls, path: Path, said: Said) -> Found:
         """Attributes of the file, or of the data set, say how it was recorded, by the names of `FACTS`."""
-        name = said.dataset or "frames"
+        name, within, inside = said.dataset or "frames", "", said.dataset is None
         with opened(path) as file:
-            detections = said.dataset is None and holds_detections(path, set(file), _has_stack(file), said)
-            stored = _data_set(file, "time" if detections else name, path, axes=1 if detections else 3)
-            nodes = (stored, file)
+            group = file
+            if said.dataset is not None and hasattr(found := _node(file, name, path, group=None), "keys"):
+                group, within, inside = found, f"{name.strip('/')}/", True
+                name = f"{within}frames"
+            told = said.modality or attribute((group, file) if within else (file,), "modality", path)
+            detections = inside and holds_detections(path, set(group), _has_stack(group), told)
+            stored = _data_set(file, f"{within}time" if detections else name, path, axes=1 if detections else 3)
+            nodes = (stored, group, file) if within else (stored, file)
             known = facts(path, lambda key: attribute(nodes, key, path))
             sources = dict.fromkeys(known, "the file")
-            known |= said_in_words(path, lambda key: attribute(nodes, key, path), detections, said)
+            known |= in_words(path, lambda key: attribute(nodes, key, path), detections, known)
             if detections:
-                refuse_fine_times(path, set(file))
-                check_lengths(path, *(_count_of(_data_set(file, key, path)) for key in ("time", "pixel")))
-                return Found(known, Detections(path, lambda: _pieces(path, [("pixel", "time")])), sources=sources)
+                refuse_fine_times(path, set(group))
+                pixel, time = f"{within}pixel", f"{within}time"
+                check_lengths(path, *(_count_of(_data_set(file, key, path)) for key in (time, pixel)))
+                return Found(known, Detections(path, lambda: _pieces(path, [(pixel, time)])), sources=sources)
             shape, dtype = stored.shape, stored.dtype
             matlab = "MATLAB_class" in stored.attrs
         packed = is_packed(path, shape, known, said)

@@ -40,7 +40,7 @@ class Channels:
         self.used = np.zeros(0, bool)
         self.numbered = np.zeros(0, bool)  # those in use that some file knows by their number alone
         self.names: dict[int, str] = {}
-        self.declared: list[int] | None = None
+        self.declared: np.ndarray | None = None  # each once, in the order in which the files name them
         self.where: Path | None = None  # the first file with detections
 
     def add(self, path: Path, found: Found) -> None:
@@ -58,18 +58,27 @@ class Channels:
                     f"{path}: some files call the channel {channel} {name}, others do not; import these by themselves"
                 )
         if found.pixels is not None:
-            self.declared = [*(self.declared or []), *(c for c in found.pixels if c not in (self.declared or []))]
+            numbers = np.asarray(found.pixels, np.int64)
+            before = np.zeros(0, np.int64) if self.declared is None else self.declared
+            self.declared = np.concatenate([before, numbers[~np.isin(numbers, before)]])
 
     @property
     def in_use(self) -> list[int]:
         """Channels with a detection; those with a name come first."""
         return sorted(map(int, np.flatnonzero(self.used)), key=lambda c: (c not in self.names, c))
 
-    def as_pixels(self) -> tuple[int, ...]:
-        """The channels that become pixels where nobody says which: those that the files declare, or those in use."""
+    def as_pixels(self, path: Path) -> tuple[int, ...]:
+        """The channels that become pixels where nobody says which: those that the files declare, or those in use.
+
+        path: the first file, for messages. Raises InputError where they are more than can be held.
+        """
+        in_use = self.in_use
         if self.declared is None:
-            return tuple(self.in_use)
-        return (*self.declared, *(c for c in self.in_use if c not in self.declared))
+            return tuple(in_use)
+        rest = np.asarray(in_use, np.int64)
+        rest = rest[~np.isin(rest, self.declared)]
+        _check_size(path, 1, len(self.declared) + len(rest))
+        return (*map(int, self.declared), *map(int, rest))
 
     def chosen(self, names: Sequence[str]) -> tuple[int, ...]:
         """The channels that are called so. Raises InputError where none of them has a detection."""
@@ -90,6 +99,15 @@ class Channels:
         """Channels as the file calls them, in a row."""
         shown = ", ".join(self.names.get(c, str(c)) for c in channels[:_MOST_NAMED])
         return shown + (", ..." if len(channels) > _MOST_NAMED else "")
+
+
+def _check_size(path: Path, rows: int, columns: int) -> None:
+    """Raise InputError for more pixels than can be held."""
+    if rows * columns > MOST_CHANNELS or max(rows, columns) > MOST_ROWS:
+        raise InputError(
+            f"{path}: {rows} x {columns} pixels are more than the {MOST_CHANNELS:,}, and {MOST_ROWS:,} in a row or "
+            "column, that can be held; give other --rows and --columns"
+        )
 
 
 def _either(one: np.ndarray, two: np.ndarray) -> np.ndarray:
@@ -124,15 +142,11 @@ def array(
                 f"--channels: {len(numbers)} channels are no {_by(shape)} pixels; name a channel for each pixel"
             )
     elif shape is None:
-        numbers = channels.as_pixels()
+        numbers = channels.as_pixels(path)
     rows, columns = shape or (1, len(numbers or ()))
     if rows * columns == 0:
         raise InputError(f"{path}: holds no detection at all; give --rows and --columns to import it nevertheless")
-    if rows * columns > MOST_CHANNELS or max(rows, columns) > MOST_ROWS:
-        raise InputError(
-            f"{path}: {rows} x {columns} pixels are more than the {MOST_CHANNELS:,}, and {MOST_ROWS:,} in a row or "
-            "column, that can be held; give other --rows and --columns"
-        )
+    _check_size(path, rows, columns)
     if positions is not None:
         return Array(Layout(1, len(positions), np.nan, np.nan, positions), numbers)
     return Array(Layout(rows, columns, np.nan, np.nan), numbers)

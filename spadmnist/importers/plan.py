@@ -147,8 +147,8 @@ def clock(found: Found, path: Path, said: Said, plan: Measurement, capture: Capt
     held, bits = found.frames.shape[0], 0
     if capture.modality == "counts":
         bits = said.bits or found.facts.get("bits", 0)
-        counter = said.counting == "counter" if said.counting else found.facts.get("counter") == 1
-        known = capture_files.clock_of_counts(c, held, bits, "counter" if counter else "frames")
+        counting = said.counting or found.facts.get("counting", "frames")
+        known = capture_files.clock_of_counts(c, held, bits, counting)
         if known is not None:
             return known
     elif held == c.frames:

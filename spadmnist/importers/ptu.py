@@ -191,10 +191,14 @@ def _records(path: Path, tags: dict[str, Any], start: int) -> tuple[_Records, li
         notes.append("its header was never finished, as of a recording that broke off")
     elif declared < held:
         notes.append(f"{held:,} records follow where its header declares {declared:,}; the rest was not read")
-    if declared > min(held, MOST_EVENTS):
+    if declared > held:
         raise InputError(
-            f"{path}: declares {declared:,} records, {held:,} follow and {MOST_EVENTS:,} can be read; copy it again, "
-            "or cut it into several"
+            f"{path}: declares {declared:,} records, {held:,} follow: it was cut short; copy it again from where "
+            f"it was made, or, where that is all there is, write {held} into TTResult_NumberOfRecords of its header"
+        )
+    if declared > MOST_EVENTS:
+        raise InputError(
+            f"{path}: has {declared:,} records, more than the {MOST_EVENTS:,} that can be read; cut it into several"
         )
     return _Records(path, start, declared), notes
 

@@ -12,6 +12,7 @@ import numpy as np
 from .. import units
 from ..errors import InputError
 from ..events import Layout
+from ..import_options import options
 from ..readout import counts_type, no_detection
 from ..recording import Capture, Recording
 from . import Found, Said, Stack, are_whole, ask, no_whole
@@ -67,24 +68,57 @@ def modality(path: Path, found: Found, said: Said) -> str:
 
     Raises InputError where that does not tell.
     """
-    told = said.modality
+    told, stated = said.modality, found.facts.get("modality")
     if told is not None and ((found.frames is None) != (told == "tr") or (found.packed and told != "qis")):
         what = "packed bits, which are qis" if found.packed else "frames" if found.frames is not None else "tr"
         raise InputError(f"{path}: holds {what}, and no {told}; leave out --modality")
+    if stated is not None:
+        _check_stated(path, stated, found, said)
     if found.frames is None:
         return "tr"
-    if told or found.packed or found.bits:
-        return told or "qis"
-    if said.bits or "bits" in found.facts:
+    if told or stated or found.packed or found.bits:
+        return told or stated or "qis"
+    if said.bits:
         return "counts"
+    of_counts = {"bits", "counting"} & set(found.facts)
+    if of_counts and "tick" in found.facts:
+        which = " and ".join(sorted(of_counts))
+        raise InputError(f"{path}: says its {which}, as of counts, and its tick, as of str; say with --modality which")
+    if of_counts:
+        return "counts"
+    binary = _white(found.frames) is not None
+    if binary and "tick" in found.facts:
+        raise InputError(
+            f"{path}: says its tick, and all its numbers are 0 and 1 (or 255); say with --modality whether they are "
+            "str, time stamps, or qis, bits"
+        )
     if "tick" in found.facts:
         return "str"
-    if _white(found.frames) is None:
+    if not binary:
         raise InputError(
             f"{path}: holds numbers other than 0 and 1 (or 0 and 255), so they are no bits; give --bits where they are "
             "counts, --modality str and --tick where they are time stamps, --packed where a byte is eight columns"
         )
     return "qis"
+
+
+def _check_stated(path: Path, stated: str, found: Found, said: Said) -> None:
+    """Raise InputError where the user, or something else that the file says or holds, contradicts its modality."""
+    says = f"{path}: says that its modality is {stated}"
+    if said.modality not in (None, stated):
+        raise InputError(f"{says}; leave out --modality")
+    if stated not in options()["bits"].modalities and said.bits is not None:
+        raise InputError(f"{says}, which has no --bits; leave it out")
+    if found.packed and stated != "qis":
+        raise InputError(f"{says}, but holds packed bits, which are qis; correct it")
+    for name in ("bits", "counting", "tick"):
+        of, value = options()[name].modalities, found.facts.get(name)
+        one_bit = stated == "qis" and name == "bits" and value == 1
+        if value is not None and stated not in of and not one_bit and said.modality is None:
+            raise InputError(
+                f"{says} and its {name} {value}, which only {' and '.join(of)} have; correct it, or add --modality "
+                f"{stated}"
+            )
 
 
 def _white(stack: Stack) -> int | None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
+from decimal import Decimal, DecimalException
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,7 @@ def _detections(path: Path, shape: tuple[int, int] | None, tick: float) -> Piece
             channel, where = _channels(head, table, shape)
             time = sum((table[:, i] * _ratio(scale, tick) for i, scale, _ in head.times), np.zeros(len(table)))
             if time.max(initial=0) >= _ROUNDED:
-                time = _exact(lines, head, tick)
+                time = _exact(lines, head, tick, time)
             whole = np.rint(time)
             fine = (channel >= 0) & (channel < MOST_CHANNELS) & (channel == np.floor(channel))
             fine &= (time >= 0) & (whole < _MOST_TICKS)
@@ -108,14 +109,18 @@ def _detections(path: Path, shape: tuple[int, int] | None, tick: float) -> Piece
 _ROUNDED = 2.0**49  # ticks from which on a double may round a decimal to another tick
 
 
-def _exact(lines: Sequence[str], head: _Head, tick: float) -> np.ndarray:
-    """(lines that are not empty,) times in ticks, rounded once, from the decimals as they are written."""
-    found = []
-    for line in filter(str.strip, lines):
-        cells = line.replace(",", ".").split(";") if head.separator == ";" else line.split(head.separator)
-        time = sum(Decimal(cells[i].strip()) * Decimal(repr(scale)) for i, scale, _ in head.times)
-        found.append(float((Decimal(time) / Decimal(repr(tick))).to_integral_value()))
-    return np.array(found)
+def _exact(lines: Sequence[str], head: _Head, tick: float, rough: np.ndarray) -> np.ndarray:
+    """(lines that are not empty,) times in ticks, rounded once, from the decimals as they are written.
+
+    rough: the same as doubles give them; they stay where an exponent is beyond what decimals can have.
+    """
+    found = rough.copy()
+    for row, line in enumerate(filter(str.strip, lines)):
+        cells = line.split(head.separator)
+        with contextlib.suppress(DecimalException):
+            time = sum(Decimal(cells[i].strip()) * Decimal(repr(scale)) for i, scale, _ in head.times)
+            found[row] = float((Decimal(time) / Decimal(repr(tick))).to_integral_value())
+    return found
 
 
 def _head(text: str, path: Path) -> _Head:
@@ -212,27 +217,45 @@ def _pieces(file: Any, path: Path, head: _Head) -> Iterator[tuple[int, list[str]
         if len(rest) > _LONGEST_LINE:
             raise InputError(f"{path}: has a line of more than {_LONGEST_LINE} characters; is it a table?")
         lines = text.split("\n") if text or end else []
+        if head.separator == ";":
+            lines = [one.replace(",", ".") for one in lines]
         if text.strip():
             yield line, lines, _numbers(lines, line, path, head)
         line += len(lines)
 
 
 def _numbers(lines: Sequence[str], line: int, path: Path, head: _Head) -> np.ndarray:
-    if head.separator == ";":
-        lines = [one.replace(",", ".") for one in lines]
+    """(lines that are not empty, columns) their numbers. Raises InputError with the first line that has others."""
+    hint = "; numbers may have a decimal comma where semicolons separate them" if head.separator == "," else ""
     try:
         table = np.loadtxt(lines, delimiter=head.separator, ndmin=2, comments=None)
     except ValueError as error:
         like = "1250" if head.alone else "3,1250"
         for number, text in enumerate(lines, line):
-            if text.strip() and len(text.strip().split(head.separator)) != head.columns:
-                count = len(text.strip().split(head.separator))
+            cells = text.strip().split(head.separator) if text.strip() else ["0"] * head.columns
+            if (count := len(cells)) != head.columns:
                 raise InputError(
                     f"{path}:{number}: has {count} column{'s' * (count != 1)}, and the lines before {head.columns}; a "
-                    f"line is {like}"
+                    f"line is {like}{hint if count > head.columns else ''}"
+                ) from None
+            for cell in itertools.filterfalse(_is_number, cells):
+                why = "; write a decimal point, or separate the columns by semicolons" if "," in cell else ""
+                why = "; take the quotes out" if '"' in cell or "'" in cell else why
+                raise InputError(
+                    f"{path}:{number}: could not convert {cell.strip()[:40]!r} to a number; a line is {like}{why}"
                 ) from None
         raise InputError(f"{path}: {image_files.reason(error)}, from line {line} on; a line is {like}") from None
     if table.shape[1] != head.columns:
         what = "a pixel and a time" if head.columns == 2 else f"{head.columns} numbers, as the first line says"
-        raise InputError(f"{path}:{line}: has {table.shape[1]} columns; a line is {what}")
+        more = hint if table.shape[1] > head.columns else ""
+        raise InputError(f"{path}:{line}: has {table.shape[1]} columns; a line is {what}{more}")
     return table
+
+
+def _is_number(cell: str) -> bool:
+    """Is it one for a table's reader?"""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return cell.isascii() and "_" not in cell

@@ -79,16 +79,12 @@ def Capture(
         raise _wrong(id, f"counting means nothing for {modality.upper()}; leave it out")
     if modality in ("qis", "counts"):
         _none(id, modality, tick=tick)
-    numbers = {
-        "wavelength": wavelength,
-        "exposure": exposure,
-        "frame_time": frame_time,
-        "frame_period": frame_period,
-        "tick": tick,
-    }
-    for name, value in numbers.items():
+    times = {"exposure": exposure, "frame_time": frame_time, "frame_period": frame_period, "tick": tick}
+    for name, value in {"wavelength": wavelength, **times}.items():
         if value is not None and not (_number(value) and value > 0):
             raise _wrong(id, f"{name} is {value!r}; it is more than 0, in {'m' if name == 'wavelength' else 's'}")
+    for name, value in times.items():
+        _check_time(id, name, value)
     shares = {"relative_uncertainty": relative_uncertainty, "own_uncertainty": own_uncertainty}
     for name, value in {"irradiance": irradiance, "lux": lux}.items():
         if value is not None and not (_number(value) and value > 0):
@@ -113,6 +109,7 @@ def Capture(
     if frame_time > period * (1 + 1e-12):
         raise _wrong(id, f"frame_time {frame_time!r} s does not fit into the frame_period {period!r} s")
     whole = int(frames) * period
+    _check_time(id, "frames x frame_period", whole)
     if exposure is not None and abs(exposure - whole) > 1e-9 * whole:
         raise _wrong(id, f"exposure {exposure!r} s is not frames x frame_period, {whole:g} s; leave it out")
     clock = whole, int(frames), frame_time, period, light.wavelength
@@ -162,6 +159,11 @@ def _light(
     if lux is not None:
         return Light(colour, float(lux), "lux", common, own)
     return Light(colour, None if irradiance is None else float(irradiance), "irradiance", common, own)
+
+
+def _check_time(id: str, name: str, value: float | None) -> None:
+    if value is not None and not units.SHORTEST <= value <= units.LONGEST:
+        raise _wrong(id, f"{name} is {value!r} s; a time is from {units.SHORTEST:g} s to {units.LONGEST:g} s")
 
 
 def _none(id: str, modality: str, **given: Any) -> None:

@@ -144,8 +144,12 @@ class _Reader(Reader):
             first: dict[Any, int] = {}
             for i, one in enumerate(raw):
                 name = one.get(what) if isinstance(one, Mapping) else None
-                if isinstance(name, str) and first.setdefault(name, i) != i:
-                    self.say(("captures", i, what), f"{name} is that of captures[{first[name]}]; give each {key} once")
+                if not isinstance(name, str):
+                    continue
+                same = disk.identity(self.base / name) if what == "file" and name.isprintable() else name
+                if (at := first.setdefault(same, i)) != i:
+                    is_file = "" if raw[at][what] == name else f"the same file as {raw[at][what]}, "
+                    self.say(("captures", i, what), f"{name} is {is_file}that of captures[{at}]; give each {key} once")
         return [one for one in found if one is not None]
 
     def capture(self, path: Path_, raw: Any, layout: Layout | None) -> tuple[Capture, Path | None] | None:
@@ -226,6 +230,9 @@ class _Reader(Reader):
             if entry.exposure is not None and abs(entry.exposure - c.exposure) > 1e-9 * entry.exposure:
                 whole = units.show(c.exposure, "s")
                 self.say((*path, "exposure"), f"{entry.exposure} is not frames x frame_period, {whole}; take it out")
+            if c.exposure > units.LONGEST:
+                whole = f"{c.exposure:g} s"
+                self.say((*path, "frames"), f"frames x frame_period is {whole}; it is at most {units.LONGEST:g} s")
             most = c.frames
         if isinstance(entry, Counts):
             # a file says itself whether its frames are counted, or those that they sum
