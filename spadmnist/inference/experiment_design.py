@@ -176,8 +176,8 @@ def between_totals(scan: Scan, evaluation: Evaluation, setup: SetupExplanation, 
         some, more = sorted(closed_form(InTheDark.of(s) if capture.light.dark else s, capture)(x) for s, x in either)
         most = most_detections(capture, sensor.layout.pixels)
         free = 1.0 - min(more / most, 1.0) if math.isfinite(most) else 1.0  # frames that are full say nothing
-        light = capture.light.own_uncertainty**2 + _CALIBRATED**2
-        z = (more - some) / math.sqrt(max(more * free, _LEAST_COUNTS) + light * (more * free) ** 2)
+        known = capture.light.own_uncertainty**2 + _CALIBRATED**2
+        z = (more - some) / math.sqrt(max(more * free, _LEAST_COUNTS) + known * (more * free) ** 2)
         if best is None or z > best[0]:
             best = z, words
     if best is None or best[0] < 1.0:
