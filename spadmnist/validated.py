@@ -57,7 +57,12 @@ class Amount:
         return core_schema.no_info_plain_validator_function(self.read)
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
-        return written(self.unit, signed=False)
+        text = written(self.unit, signed=False)
+        if self.unit:  # a number and its unit are a text, of which a schema knows no range
+            return text
+        bare = {"type": "number", "minimum" if self.zero else "exclusiveMinimum": 0}
+        bare |= {"maximum": self.most} if self.most < math.inf else {}
+        return {"anyOf": [bare, *text["anyOf"][1:]]}
 
 
 Time = Annotated[units.Quantity, Amount("s", most=units.LONGEST, least=units.SHORTEST)]

@@ -118,6 +118,11 @@ def test_every_key_of_a_file_is_explained_on_its_page(kind: str) -> None:
         assert row[2], f"{kind}: {row[0]} does not say what it may be"
 
 
+def test_the_range_of_a_share_is_told_with_its_open_end() -> None:
+    assert re.search(r"^\| `fill_factor` \| .* \| number more than 0 and at most 1 or ", keys.page("sensor"), re.M)
+    assert re.search(r"^\| `own_uncertainty` \| .* \| number from 0 to 1 or ", keys.page("measurement"), re.M)
+
+
 def test_a_new_key_appears_on_the_page_of_its_file(monkeypatch: pytest.MonkeyPatch) -> None:
     made = schema.of("measurement")
     made["properties"]["planted"] = {"type": "integer", "minimum": 3, "description": "a new key"}

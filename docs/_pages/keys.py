@@ -126,9 +126,10 @@ def _form(made: Node, node: Node) -> str:
 
 def _range(node: Node, what: str) -> str:
     low, high = node.get("minimum"), node.get("maximum")
-    words = [f"from {low:,}" if low is not None else "", f"to {high:,}" if high is not None else ""]
+    words = [f"from {low:,}" if low is not None else ""]
     if "exclusiveMinimum" in node:
-        words.append(f"more than {node['exclusiveMinimum']:,}")
+        words.append(f"more than {node['exclusiveMinimum']:,}{' and' if high is not None else ''}")
+    words.append("" if high is None else f"{'at most' if 'exclusiveMinimum' in node else 'to'} {high:,}")
     if "exclusiveMaximum" in node:
         high = node["exclusiveMaximum"]
         words.append(f"less than 2^{high.bit_length() - 1}" if high > 10**15 else f"less than {high:,}")
