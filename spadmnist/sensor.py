@@ -381,10 +381,11 @@ class Sensor:
         candidates = rate
         for effect in self.at("dead_time"):
             rate = hooks.expected(effect, rate, conditions)
-        if opened is not None and self.at("dead_time"):
-            rate = gates.detected(
-                candidates, rate, opened * conditions.live_time / conditions.frames, conditions, self.extends
-            )
+        # by a device's rules nothing fires in the gaps between frames: each begins alive, as an opening does
+        apart = self.rules == "device" and conditions.live is not None and not first
+        if (opened is not None or apart) and self.at("dead_time"):
+            opening = (1.0 if opened is None else opened) * conditions.live_time / conditions.frames
+            rate = gates.detected(candidates, rate, np.asarray(opening), conditions, self.extends)
         for stage in ("timing", "readout") if stamped else ():
             for effect in self.at(stage):
                 rate = hooks.expected(effect, rate, conditions)
