@@ -14,7 +14,7 @@ import pytest
 import spadmnist as sp
 from spadmnist import plugins
 from spadmnist.effects import Conditions
-from spadmnist.inference.closed_forms import closed_form, in_frames
+from spadmnist.inference.closed_forms import closed_form, error_by_causes, in_frames
 from spadmnist.inference.mean_alone import of_mean
 from spadmnist.streams import Streams
 
@@ -164,6 +164,83 @@ def test_flicker_over_the_whole_exposure_is_the_mean_of_its_curve() -> None:
     c = Conditions(0.05, 1, 0.05, 0.05, 500e-9)
     times = (np.arange(100_000) + 0.5) / 100_000 * c.exposure
     assert slow.expected_rate(np.ones((1, 1)), c)[0, 0] == pytest.approx(slow.factor(times, c).mean(), rel=1e-9)
+
+
+GATE = effects.ShortGate(fraction=0.5)
+SLOW_TRAPS = effects.SlowAfterpulsing(probability=0.1, lifetime=5e-6)
+FEW_TRAPS, BLIND = effects.Afterpulsing(probability=0.02, lifetime=5e-6), effects.DeadTime(duration=50e-9)
+
+
+def stamps_of(exposure: float, rate: float) -> sp.Capture:
+    light = {"wavelength": 500e-9, "irradiance": rate / (25e-12 / 3.97289171e-19)}
+    return sp.Capture("one", "tr", **light, exposure=exposure)
+
+
+@pytest.mark.parametrize(
+    ("some", "capture", "rate"),
+    [
+        ([effects.Flicker(amplitude=0.5, frequency=1e5), GATE], counter_of(100, 1e-5, 1.0), 4e6),
+        ([effects.SourceDrift(slope=0.5), GATE], stamps_of(1e-3, 1.0), 4e6),
+        ([effects.Flicker(amplitude=1.0, frequency=1e3), effects.SourceDrift(slope=2.0)], stamps_of(1e-3, 1.0), 4e6),
+    ],
+)
+def test_the_mean_of_curves_and_gates_is_that_of_their_product(
+    some: list[Any], capture: sp.Capture, rate: float
+) -> None:
+    """A factor that is large while the gate is open, or with another one."""
+    total, error, expected = total_and_closed_form(sensor(*some), capture, rate)
+    assert expected == pytest.approx(total, abs=5 * error)
+
+
+def test_the_mean_of_a_curve_in_many_openings_is_its_integral() -> None:
+    """Of a flicker that slips through the frames, and whose mean over the whole exposure is another."""
+    flicker, gate = effects.Flicker(amplitude=0.5, frequency=1.0371e5), effects.ShortGate(fraction=0.37)
+    for c in (counter_of(300, 1e-5, 1.0).conditions, counter_of(300, 1e-5, 1.0, 3e-5).conditions.within_frames):
+        within = (np.arange(500) + 0.5) / 500 * 0.37 * c.frame_time
+        times = np.add.outer(np.arange(300) * c.frame_period, within).ravel()
+        events = 1e6 * 300 * 0.37 * c.frame_time * flicker.factor(times, c).mean()
+        assert sensor(flicker, gate).expected(np.full((1, PIXELS), 1e6), c)[1] == pytest.approx(events, rel=4e-4)
+
+
+@pytest.mark.parametrize("traps", [FEW_TRAPS, SLOW_TRAPS])
+@pytest.mark.parametrize("dead_times", [1.0, 5.0])
+def test_detections_alone_fill_traps(traps: Any, dead_times: float) -> None:
+    """Of so many events in a dead time, most of which are lost."""
+    rate = dead_times / 50e-9
+    total, error, expected = total_and_closed_form(sensor(BLIND, traps), stamps_of(1e-3, rate), rate, 10)
+    assert expected == pytest.approx(total, abs=5 * error)
+
+
+def test_short_traps_find_their_pixel_awake_more_often() -> None:
+    """Within the error that is stated, a fifth of the square of their number."""
+    rate, short = 1 / 50e-9, effects.Afterpulsing(probability=0.1, lifetime=20e-9)
+    capture = stamps_of(1e-3, rate)
+    total, error, expected = total_and_closed_form(sensor(BLIND, short), capture, rate, 10)
+    assert error_by_causes(sensor(BLIND, short).resolved(), capture) == pytest.approx(0.002)
+    assert expected == pytest.approx(total, abs=5 * error + 0.002 * total)
+    assert abs(sensor(BLIND, SLOW_TRAPS).expected(np.full((1, PIXELS), rate), capture.conditions)[1].sum() - total) > (
+        0.01 * total
+    )
+
+
+@pytest.mark.parametrize("rules", ["device", "paper"])
+@pytest.mark.parametrize(
+    ("causing", "gate", "period"),
+    [
+        (SLOW_TRAPS, 0.5, 1e-5),
+        (effects.Afterpulsing(probability=0.3, lifetime=5e-6), 0.1, 1e-5),
+        (SLOW_TRAPS, 1.0, 2e-5),
+        (effects.Crosstalk(probability=0.02, delay=1e-6), 0.1, 1e-5),
+    ],
+)
+def test_what_is_caused_while_nothing_is_recorded_is_not_expected(
+    causing: Any, gate: float, period: float, rules: str
+) -> None:
+    """By the paper's rules pixels fire in the gaps between frames, and what comes out of them makes up for the loss."""
+    some = [effects.Detection(pdp=1.0), causing, effects.ShortGate(fraction=gate)]
+    model = sp.Sensor(sp.Layout(8, 8, 25e-12, 1.0), some, rules)
+    total, error, expected = total_and_closed_form(model, counter_of(1000, 1e-5, 1.0, period), 1e6, 10)
+    assert expected == pytest.approx(total, abs=5 * error)
 
 
 WARMING = '''
