@@ -213,6 +213,30 @@ def test_what_full_counters_show_is_its_mean(slots: float) -> None:
         laws.mean_is(np.minimum(drawn[:, pixel], full[pixel]), float(expected[pixel]), laws.FALSE_ALARM / 8)
 
 
+@pytest.mark.parametrize(
+    ("dead", "rate", "period", "paralyzable"),
+    [
+        (33e-9, 3e7, 1e-6, False),
+        (33e-9, 3e7, 2e-6, False),
+        (33e-9, 3e7, 1e-6, True),
+        (66e-9, 1e9, 1e-6, False),
+        (66e-9, 1e9, 2e-6, False),
+    ],
+)
+def test_counters_near_full_scatter_less_behind_a_dead_time(
+    dead: float, rate: float, period: float, paralyzable: bool
+) -> None:
+    """Four bits, and about 15 events in a frame that are hardly random; 5 standard errors of Poisson: 6e-7 at most."""
+    some = [sp.effects.Detection(pdp=1.0), sp.effects.DeadTime(duration=dead, paralyzable=paralyzable)]
+    model = sp.Sensor(Layout(8, 8, PIXEL, 1.0), some, rules="device").resolved()
+    clock = {"frames": 1000, "frame_time": 1e-6, "frame_period": period, "bits": 4, "counting": "counter"}
+    capture = lit("f", "counts", rate, **clock)
+    light = Streams(1, "a", "train", np.arange(1, dtype=np.uint64))
+    found = model.expose(np.full((1, 64), rate), capture.conditions, light, ("counts",)).tally
+    total = float(np.asarray(found, np.int64).sum())
+    assert closed_form(model, capture)(rate) == pytest.approx(total, abs=5 * math.sqrt(total))
+
+
 def test_the_closed_form_of_a_full_counter_has_its_elasticity() -> None:
     capture = lit("f", "counts", 1e6, **{**COUNTER, "bits": 3})
     form = closed_form(sensor(ticks=False).resolved(), capture)
