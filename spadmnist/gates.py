@@ -20,7 +20,8 @@ def detected(
     If the dead time is shorter than the closed time, every opening begins with a live pixel. Its detections are then a
     renewal process, whose dead time follows from the steady rates. If the dead time is longer, their number is that of
     the mean rate over the frame, and at most that of a live pixel; the tests allow 6 % against the simulation. Where
-    events extend the dead time, both cases are exact.
+    events extend the dead time, both cases are exact after many frames. The start of an exposure is left out: its
+    pixels are alive, and few frames, with a dead time as long as they are, count more (10 % was seen).
     Source: Cox, Renewal Theory (1962), ch. 4; for long openings its asymptotic mean.
 
     Args:
