@@ -415,9 +415,35 @@ class Sensor:
             rate = self._recorded(candidates, opening, conditions)
         for stage in ("timing", "readout") if stamped else ():
             for effect in self.at(stage):
-                rate = hooks.expected(effect, rate, conditions)
+                rate = self._read_out(effect, rate, opened, opening, conditions)
         live = conditions.live_time if opened is None else opened * conditions.live_time
         return candidates * live, rate * live
+
+    def _read_out(
+        self,
+        effect: Effect,
+        rate: np.ndarray,
+        opened: np.ndarray | None,
+        opening: np.ndarray | None,
+        conditions: Conditions,
+    ) -> np.ndarray:
+        """The detections behind an effect, 1/s while gates are open.
+
+        Of a load of openings it takes what it takes of a steady one, and what it holds at their ends; and no more than
+        of the load on average.
+        """
+        steady = hooks.expected(effect, rate, conditions)
+        if effect.backlog() == 0 or opened is None or opening is None:
+            return steady
+        averaged = hooks.expected(effect, rate * opened, conditions) / np.maximum(opened, 1e-300)
+        events = (steady * opening).sum(axis=-1, keepdims=True)
+        return np.asarray(np.minimum(averaged, steady * (1 + effect.backlog() / np.maximum(events, 1e-300))))
+
+    @property
+    def states_mean(self) -> bool:
+        """Whether the closed forms of all effects say what these do to the mean; of a backlog of a gate, roughly."""
+        held = self.at("gate") and any(effect.backlog() > 0 for effect in self.effects)
+        return not held and all(effect.states_mean for effect in self.effects)
 
     def _together(self, conditions: Conditions) -> dict[str, float]:
         """The means of products over the products of the means, where more than one effect follows the time.

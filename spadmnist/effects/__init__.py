@@ -307,6 +307,12 @@ class Effect(Plugin, abstract=True):
         """
         return None
 
+    def backlog(self) -> float:
+        """Detections that it holds and still lets pass when no more come, of the array; its closed form is of a steady
+        load. Readout stage. Default: 0.
+        """
+        return 0.0
+
     def mean_delay(self) -> float | None:
         """The mean of the exponential time after which an event causes others, s; None: of another law, or unknown.
 

@@ -64,7 +64,7 @@ def _is_bent(sensor: Sensor, capture: Capture, level: float) -> bool:
     Where all detections are counted, the mean rate alone matters, unless a dead time loses a part of them.
     """
     sensor = InTheDark.of(sensor) if capture.light.dark else sensor
-    if not sensor.at("arrival") and all(effect.states_mean for effect in sensor.effects):
+    if not sensor.at("arrival") and sensor.states_mean:
         return False
     if not capture.counts_events:
         return True
@@ -81,7 +81,7 @@ def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[fl
     curves = [effect for effect in sensor.at("arrival") if hasattr(effect, "factor")]
     apart, c = _of_curves(sensor, curves, capture, level), capture.conditions
     steady = sensor.changed(effects=[effect for effect in sensor.effects if effect not in curves])
-    if not steady.at("arrival") and all(effect.states_mean for effect in steady.effects):
+    if not steady.at("arrival") and steady.states_mean:
         return apart, 0.0
     if steady.layout.pixels > _PIXELS and c.scene is None:
         steady = _part(steady)
