@@ -200,6 +200,11 @@ def recovered(effect: Effect, chance: np.ndarray) -> np.ndarray:
     return high
 
 
+def awake_after(effect: Effect) -> float:
+    """The time after the blind time from which on every event fires, whatever it draws, s."""
+    return float(recovered(effect, np.array([1 - 2.0**-53]))[0])  # the largest number that is drawn
+
+
 def influence(effect: Effect) -> float:
     """How far an effect's events matter, pitches."""
     reach = call(effect, "influence")

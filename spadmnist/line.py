@@ -274,8 +274,7 @@ class Line:
             return _NONE
         needed = np.zeros(len(events))
         for effect in sensor.soft:
-            longest = float(hooks.recovered(effect, np.array([1 - 2.0**-53]))[0])
-            close = kernels.followers(events.times, events.offsets, sensor.dead_times + longest)
+            close = kernels.followers(events.times, events.offsets, sensor.dead_times + hooks.awake_after(effect))
             rng = self.streams.draws(f"{effect.name}/sensitivity", len(events))
             chance = kernels.uniforms(close, events.image_offsets, rng.images, rng.key, rng.before)
             needed[close] = np.maximum(needed[close], hooks.recovered(effect, chance))

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import kernels
+from . import hooks, kernels
 from .readout import Frames, Recorded, summarised
 from .streams import Streams, beginning
 
 if TYPE_CHECKING:
-    from .effects import Conditions
+    from .effects import Conditions, Effect
     from .sensor import Sensor
 
 _DRAWS_AT_ONCE = 4e6  # expected draws of the rows that are drawn together: 70 MB
@@ -27,7 +27,8 @@ def tying(sensor: Sensor, conditions: Conditions, part: Conditions) -> str | Non
     conditions: of all frames; part: of a stretch of them. Frames are also tied where they are not alike.
     """
     carrying = [e for e in sensor.at("dead_time") if hasattr(e, "carried") and e.carried() > 0]
-    for effect in (*sensor.at("arrival"), *sensor.at("correlated"), *carrying, *sensor.uncounted):
+    blinding = _blinding(sensor, conditions)
+    for effect in (*sensor.at("arrival"), *sensor.at("correlated"), *carrying, *blinding, *sensor.uncounted):
         return effect.name
     one = np.ones((1, sensor.layout.pixels))
     both = zip(sensor.rates(one, conditions), sensor.rates(one, part), strict=True)
@@ -40,6 +41,24 @@ def tying(sensor: Sensor, conditions: Conditions, part: Conditions) -> str | Non
     times = frame * conditions.frame_period + within
     gates: list[Any] = list(sensor.at("gate"))
     return next((e.name for e in gates if not np.array_equal(e.open(within, part), e.open(times, conditions))), None)
+
+
+def _blinding(sensor: Sensor, conditions: Conditions) -> list[Effect]:
+    """The effects that leave a pixel blind, or half awake, from one frame of a counter to the next.
+
+    A counter is read at the end of a frame, and its pixel goes on. Where the rules let nothing fire between frames, it
+    is awake again in the next one if the gap is as long as all that lasts.
+    """
+    if conditions.counting != "counter" or not conditions.bits:
+        return []
+    lasting = {e: hooks.awake_after(e) for e in sensor.soft}
+    longest = float(sensor.dead_times.max(initial=0.0))
+    gap = conditions.frame_period - conditions.frame_time if sensor.rules == "device" else 0.0
+    if gap >= longest + max(lasting.values(), default=0.0):
+        return []
+    pixels = sensor.layout.pixels
+    blind = [e for e in sensor.at("dead_time") if hasattr(e, "blind_time") and np.any(hooks.blind_time(e, pixels) > 0)]
+    return [*blind, *(e for e, time in lasting.items() if time > 0)]
 
 
 def by_bits(sensor: Sensor, conditions: Conditions, part: Conditions) -> bool:

@@ -1,7 +1,8 @@
 """The model's twin of a measurement: the same captures, as a sensor would have recorded them.
 
 A capture is one image of uniform light. What is too large for the memory is simulated in stretches of frames where
-that is exact: where frames do not depend on each other.
+that is exact: where frames do not depend on each other. Others are simulated some pixels after the others, where
+nothing ties these together.
 """
 
 from __future__ import annotations

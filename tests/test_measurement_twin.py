@@ -23,9 +23,12 @@ from scipy import stats
 
 import spadmnist.sensor
 from spadmnist import config, measurement, twin
+from spadmnist.effects import Conditions
+from spadmnist.effects.dead_time import DeadTime
 from spadmnist.effects.detection import Detection
 from spadmnist.effects.flicker import Flicker
 from spadmnist.effects.short_gate import ShortGate
+from spadmnist.effects.slow_recovery import SlowRecovery
 from spadmnist.events import Layout
 from spadmnist.inference.comparison import compare
 from spadmnist.plugins import ByWavelength
@@ -161,6 +164,45 @@ def test_frames_that_depend_on_each_other_are_not_cut(monkeypatch: pytest.Monkey
     images = np.zeros(1, np.uint64)
     streams = Streams(1, "x", "model", images)
     refused(lambda: twin.model_recordings(device(), one("tr"), 1e6, streams, images), "would hold", "shorten it")
+
+
+def test_counters_that_a_dead_time_ties_are_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dead time of five frames: in ten of them a pixel counts 2 in bright light, however large the capture is."""
+    effects = [Detection(pdp=1.0), DeadTime(duration=5e-6)]
+    sensor = Sensor(Layout(4, 4, 25e-12, 1.0), effects, "device").resolved()
+    capture = counter_of(10, 1e-6, 1e-6)
+    whole = ones_of(sensor, capture, 1e9, 1)
+    large(monkeypatch)
+    assert np.array_equal(ones_of(sensor, capture, 1e9, 1), whole) and np.all(whole.sum(axis=0) == 2)
+
+
+@pytest.mark.parametrize(
+    ("rules", "gap", "dead", "recovery", "cut"),
+    [  # us
+        ("device", 0.0, 0.05, 0.0, False),
+        ("device", 0.04, 0.05, 0.0, False),
+        ("device", 0.06, 0.05, 0.0, True),  # each frame begins alive
+        ("paper", 0.06, 0.05, 0.0, False),  # pixels fire between frames
+        ("device", 0.06, 0.0, 0.0, True),
+        ("device", 0.0, 0.0, 0.0, True),
+        ("device", 0.0, 0.0, 0.01, False),
+        ("device", 0.06, 0.05, 0.01, False),
+        ("device", 0.45, 0.05, 0.01, True),  # after 37 time constants every event fires
+    ],
+)
+def test_counters_are_cut_where_each_frame_begins_alive(
+    rules: str, gap: float, dead: float, recovery: float, cut: bool
+) -> None:
+    effects = [Detection(pdp=1.0), DeadTime(duration=dead * 1e-6), SlowRecovery(time_constant=recovery * 1e-6)]
+    sensor = Sensor(Layout(4, 4, 25e-12, 1.0), effects, rules).resolved()
+    capture = counter_of(3000, 1e-6, (1 + gap) * 1e-6)
+    assert (twin._in_parts(sensor, capture, 1e5) is not None) == cut
+    assert twin._in_parts(sensor, one("str"), 1e5) is not None  # binary frames begin anew
+
+
+def counter_of(frames: int, frame_time: float, period: float) -> Capture:
+    clock = Conditions(frames * period, frames, frame_time, period, 500e-9, 8, "counter")
+    return replace(one("counts", bits=8, counting="counter"), conditions=clock)
 
 
 def test_a_twin_needs_the_same_pixels_and_a_level(tmp_path: Path) -> None:

@@ -307,6 +307,21 @@ class Effect(Plugin, abstract=True):
         """
         return None
 
+    def backlog(self) -> float:
+        """Detections that it holds and still lets pass when no more come, of the array; its closed form is of a steady
+        load. Readout stage. Default: 0.
+        """
+        return 0.0
+
+    def mean_delay(self) -> float | None:
+        """The mean of the exponential time after which an event causes others, s; None: of another law, or unknown.
+
+        Correlated stage; without the dead time, which comes first in the event's own pixel. The closed forms leave out
+        what comes while nothing is recorded. Default: that of `hazard`, where there is one.
+        """
+        law = self.hazard(1) if type(self).hazard is not Effect.hazard else None
+        return None if law is None else law[1]
+
     def in_likelihood(self, stamped: bool, conditions: Conditions, rules: str) -> bool:
         """Whether the exact likelihood of a capture describes this effect at its values.
 

@@ -37,6 +37,10 @@ class Traps(Effect, stage="correlated", abstract=True):
         """(`hazards`, the lifetime)."""
         return self.hazards(pixels), float(self.lifetime)
 
+    def mean_delay(self) -> float:
+        """The lifetime, s."""
+        return float(self.lifetime)
+
     def influence(self) -> float:
         """A trap fires its own pixel alone."""
         return 0.0

@@ -112,6 +112,10 @@ class Crosstalk(Effect, stage="correlated"):
         )
         return Children(parent, self.delay * delay, row)
 
+    def mean_delay(self) -> float:
+        """That of the neighbour's avalanche, s."""
+        return float(self.delay)
+
     def influence(self) -> float:
         """Pitches to the farthest neighbours that are hit."""
         return float(self.reach) if self.probability else 0.0

@@ -51,6 +51,10 @@ class ReadoutLoss(Effect, stage="readout"):
         """All pixels share the bus: those around a window load it, too."""
         return math.inf if self.service_time else 0.0
 
+    def backlog(self) -> float:
+        """What waits in a full queue."""
+        return float(self.queue) - 1 if self.service_time else 0.0
+
     def expected_rate(self, rate: np.ndarray, conditions: Conditions) -> np.ndarray:
         """What a queue with Poisson arrivals and a fixed time of service takes (M/D/1/K), once it is in equilibrium.
 

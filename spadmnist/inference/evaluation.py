@@ -295,7 +295,7 @@ def _same_level(
     out = {}
     for id, made in near.made.items():
         sensor, null = sensors.mean_sensor(id), near.rates[id]
-        if id in differs or len(made.numbers) < number or not all(effect.states_mean for effect in sensor.effects):
+        if id in differs or len(made.numbers) < number or not sensor.states_mean:
             continue
         level = null.level * matched_light(replicates, near, sensor, id)
         _, stated, expected, _ = central_level(replicates, sensor, replicates.seen[id])
@@ -315,7 +315,7 @@ def _centres(replicates: Replicates, sensors: Model, without: Collection[str] = 
         for id, seen in replicates.seen.items()
         if seen.counts is not None and id not in without
     }
-    some = [id for id in out if not all(effect.states_mean for effect in sensors.mean_sensor(id).effects)]
+    some = [id for id in out if not sensors.mean_sensor(id).states_mean]
     numbers = np.arange(FEW, dtype=np.uint64)
     closed = dict(out)
     # where pixels blink by themselves a total may be far from its mean, at the stated rates

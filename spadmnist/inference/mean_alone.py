@@ -13,7 +13,7 @@ from scipy import stats
 from .. import hooks, twin
 from ..effects import Conditions, Effect
 from ..recording import Capture
-from ..sensor import Sensor
+from ..sensor import Sensor, factor
 from .closed_forms import CLOSED, closed_form, error_by_causes, events_in_frames, level_for
 from .light_levels import CaptureNull
 from .models import InTheDark
@@ -64,7 +64,7 @@ def _is_bent(sensor: Sensor, capture: Capture, level: float) -> bool:
     Where all detections are counted, the mean rate alone matters, unless a dead time loses a part of them.
     """
     sensor = InTheDark.of(sensor) if capture.light.dark else sensor
-    if not sensor.at("arrival") and all(effect.states_mean for effect in sensor.effects):
+    if not sensor.at("arrival") and sensor.states_mean:
         return False
     if not capture.counts_events:
         return True
@@ -81,7 +81,7 @@ def _of_fluctuations(sensor: Sensor, capture: Capture, level: float) -> tuple[fl
     curves = [effect for effect in sensor.at("arrival") if hasattr(effect, "factor")]
     apart, c = _of_curves(sensor, curves, capture, level), capture.conditions
     steady = sensor.changed(effects=[effect for effect in sensor.effects if effect not in curves])
-    if not steady.at("arrival") and all(effect.states_mean for effect in steady.effects):
+    if not steady.at("arrival") and steady.states_mean:
         return apart, 0.0
     if steady.layout.pixels > _PIXELS and c.scene is None:
         steady = _part(steady)
@@ -132,12 +132,14 @@ def _of_curves(sensor: Sensor, curves: Sequence[Effect], capture: Capture, level
     if capture.counts_events:
         some, moments = slice(None), max(min(_MOMENTS, _MOMENTS * _PIXELS // pixels), _FEWEST)
     rate, lit = (part[0, some] for part in sensor.rates(light, capture.conditions))
-    times = c.moments(moments)
-    swing = np.zeros((moments, 1))
-    for effect in curves:
-        factor: np.ndarray = np.ravel(effect.factor(times, capture.conditions))[:, None]  # type: ignore[attr-defined]
-        share = lit / np.maximum(rate, 1e-300) if effect.acts_on == "light" else 1.0
-        swing = swing + share * (factor / factor.mean() - 1)
+    times = sensor.open_moments(c, moments)
+    lit_share = lit / np.maximum(rate, 1e-300)
+    swing = np.zeros((len(times), 1))
+    for kind, share in (("light", lit_share), ("dark", 1 - lit_share)):
+        own = [factor(effect, times, capture.conditions) for effect in curves if effect.acts_on == kind]
+        if own:
+            product = np.prod(own, axis=0)[:, None]
+            swing = swing + share * (product / max(product.mean(), 1e-300) - 1)
     factors = np.maximum(1 + swing, 0.0)
     if capture.counts_events:
         # what share of the time a gate is open is the same for both
