@@ -8,8 +8,9 @@ laws, null_distribution           how cells scatter if the model is right; resid
 contrasts                         patterns of all cells that are tested by themselves
 light_levels                      the nuisance parameter of every capture, from its total
 closed_forms, mean_alone          that total by the effects' closed forms; captures of which the mean alone is known
-evaluation, deviations            residuals and checks of one model; failing checks that show one deviation
-captures_together                 what no capture shows by itself
+evaluation, checks                residuals of one model; its goodness of fit, one for all verbs
+totals_tests, captures_together   the totals and the light; what no capture shows by itself
+deviations                        failing checks that show one deviation
 comparison                        `compare`: does the model fit?
 candidates, coordinates           every one-step change of a model, and its free numbers
 signature, score_test             the shift of every cell that a candidate makes; the data's projection on it
