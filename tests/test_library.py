@@ -17,7 +17,8 @@ from spadmnist import measurement as measurements
 from spadmnist.errors import InputError, SpadError
 from spadmnist.inference import results
 from spadmnist.inference.candidates import Candidate
-from spadmnist.inference.comparison import Check, headline
+from spadmnist.inference.checks import Check
+from spadmnist.inference.comparison import headline
 from spadmnist.inference.results import Value
 from spadmnist.library import answers
 from spadmnist.plugins import ByWavelength, Distribution

@@ -24,7 +24,9 @@ from PIL import Image
 
 from spadmnist import pages
 from spadmnist.errors import SpadError
-from spadmnist.inference.comparison import Check, Comparison, holm_corrected, light_of
+from spadmnist.inference.checks import Check
+from spadmnist.inference.comparison import Comparison, holm_corrected
+from spadmnist.inference.light_checks import light_of
 from spadmnist.inference.light_levels import Nuisance
 from spadmnist.inference.null_distribution import Judgement
 from spadmnist.inference.totals_tests import Level

@@ -17,6 +17,7 @@ from spadmnist.errors import SpadError
 from spadmnist.events import Layout
 from spadmnist.inference import comparison
 from spadmnist.inference.closed_forms import closed_form, in_counters, level_for, rising_until
+from spadmnist.inference.light_checks import light_of
 from spadmnist.inference.map_models import information
 from spadmnist.inference.mean_alone import last_digit
 from spadmnist.inference.next_step import after_comparison
@@ -378,7 +379,7 @@ def test_captures_with_several_uncertainties_are_judged_by_their_own() -> None:
         return Level(Capture(f"to {uncertainty:g}", "tr", light, conditions), 0.03, 0.005, 1.0)
 
     def p_values(*uncertainties: float) -> list[float]:
-        _, checks = comparison.light_of([level(x) for x in uncertainties], [])
+        _, checks = light_of([level(x) for x in uncertainties], [])
         return [check.p_value for check in checks]
 
     light, known, loose = p_values(0.0, 0.05)

@@ -19,7 +19,8 @@ from spadmnist.effects import BackgroundLight
 from spadmnist.errors import InputError
 from spadmnist.inference import setups
 from spadmnist.inference.closed_forms import closed_form
-from spadmnist.inference.comparison import compare, ratios_between_wavelengths
+from spadmnist.inference.comparison import compare
+from spadmnist.inference.light_checks import ratios_between_wavelengths
 from spadmnist.inference.model_selection import diagnose
 from spadmnist.inference.models import InTheDark
 from spadmnist.inference.replicates import Execution, Replicates

@@ -16,7 +16,8 @@ import numpy as np
 import spadmnist
 from spadmnist import capture_files, config, document, factory, shard_plan, store
 from spadmnist.inference.candidates import Candidate
-from spadmnist.inference.comparison import Check, Comparison
+from spadmnist.inference.checks import Check
+from spadmnist.inference.comparison import Comparison
 from spadmnist.inference.light_levels import Nuisance
 from spadmnist.inference.results import Diagnosis, Step, Value
 

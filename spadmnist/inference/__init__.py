@@ -9,7 +9,8 @@ contrasts                         patterns of all cells that are tested by thems
 light_levels                      the nuisance parameter of every capture, from its total
 closed_forms, mean_alone          that total by the effects' closed forms; captures of which the mean alone is known
 evaluation, checks                residuals of one model; its goodness of fit, one for all verbs
-totals_tests, captures_together   the totals and the light; what no capture shows by itself
+totals_tests, light_checks        the totals, the light, the pixels' ratios between wavelengths
+captures_together                 what no capture shows by itself
 deviations                        failing checks that show one deviation
 comparison                        `compare`: does the model fit?
 candidates, coordinates           every one-step change of a model, and its free numbers

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..statistics import Summary
 from .captures_together import Together, checks_together
 from .evaluation import Evaluation
 from .levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
+from .null_distribution import Judgement
 from .replicates import TOTALS, Cell, Replicates
 from .totals_tests import tests_of_totals
 
@@ -44,8 +46,42 @@ def holm(p_values: Sequence[float], kinds: Sequence[str], tests: Sequence[int], 
 
 
 @dataclass(frozen=True)
+class Check:
+    """One check of a model: a statistic of one capture, the total of detections, or the light level.
+
+    Attributes:
+        statistic: its name; "rate" for a total, "light" for the common light level, "wavelength_ratio" for the ratio of
+            the pixels' counts between two wavelengths.
+        capture: the name of the capture; None where it is of all captures.
+        misfit: mean squared standardised residual, relative to that of the model's replicates; 1 for a right model.
+        p_value: before the correction for the number of checks.
+        passes: the model passes: the deviation is not significant, or within the tolerance.
+        significant: the p-value is significant after Holm's correction.
+        material: it is significant and exceeds the tolerance, so that the model fails.
+        where, size: the cell that shows it most, and the deviation there, in words and physical units.
+        relative: that deviation as a share of the detections or of the rate.
+    """
+
+    statistic: str
+    capture: str | None
+    misfit: float
+    p_value: float
+    where: str
+    size: str
+    relative: float
+    passes: bool = True
+    material: bool = False
+    significant: bool = False
+    excess: float = 0.0  # excess chi square (`deviations.excess`)
+    # the measured summary and the model's expectation, for pictures; None for totals
+    summary: Summary | None = field(default=None, repr=False)
+    judgement: Judgement | None = field(default=None, repr=False)
+    tests: int = field(default=1, repr=False)  # the number of tests of which `p_value` is the smallest
+
+
+@dataclass(frozen=True)
 class BlockCheck:
-    """A check: a block of cells, or the totals.
+    """A check as the search needs it: a block of cells, or the totals.
 
     Attributes:
         p: p-value, see `Null.p_value`.

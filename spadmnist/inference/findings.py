@@ -17,6 +17,7 @@ from .checks import LIGHT, BlockCheck, block_checks, failing
 from .deviations import Deviation, deviations, excess
 from .evaluation import Evaluation
 from .levels import LEAST_P
+from .light_checks import light_of
 from .light_levels import LEAST_ELASTICITY, Nuisance, totals_space
 from .replicates import Cell, Replicates
 from .results import Step, Trace, mimic, plain
@@ -196,7 +197,7 @@ def nuisances(replicates: Replicates, evaluation: Evaluation) -> list[dict[str, 
             continue  # no light level gives so few
         log = math.log(level / null.stated)
         levels.append(Level(seen.capture, log, error, elasticity=elasticity, freedom=null.freedom))
-    found, _ = comparison.light_of(levels, [s.capture for s in replicates.seen.values()])
+    found, _ = light_of(levels, [s.capture for s in replicates.seen.values()])
     return _as_data(found)
 
 
