@@ -161,7 +161,7 @@ def _diagnosed(
             path.last_rung()
     with or_as_before(path, "the set-up by the last model"):
         _renew_setup(path, notes)
-    in_sample = _compared(path)
+    in_sample = _compared(path, notes)
     verdict = _as_compared(verdict_of(path, left_over(path, notes), notes), notes, in_sample)
     if not path.steps:
         # what a nonlinearity may explain as well is not excused
@@ -197,10 +197,11 @@ def _diagnosed(
     return found
 
 
-def _compared(path: ModelPath) -> Comparison | None:
+def _compared(path: ModelPath, notes: Notes) -> Comparison | None:
     """The comparison of the model with its steps, as `compare` compares the next sensor file; None where it cannot be.
 
-    Few replicates fail no model: where they do, it is simulated as often as by `compare`.
+    Few replicates fail no model: where they do, it is simulated as often as by `compare`, unless the set-up explains
+    what fails.
     """
     replicates = path.replicates
     replicates.say("the comparison of the model with its steps")
@@ -210,12 +211,13 @@ def _compared(path: ModelPath) -> Comparison | None:
         with or_as_before(path, "the last comparison"):
             if not path.steps:
                 found = comparison_of(replicates, path.start)
-                if found.verdict == "fails" and not path.failed and has_few_replicates(path):
+                if found.verdict == "fails" and not (path.failed or notes.setup) and has_few_replicates(path):
                     look_closer(path)
                     found = comparison_of(replicates, path.start)
                 return found
             found = comparison_with(replicates, path.sensor_values)
-            if found.verdict == "fails" and found.replicates < REPLICATES and not path.failed:
+            few = found.replicates < REPLICATES
+            if found.verdict == "fails" and few and not (path.failed or notes.setup):
                 found = comparison_with(replicates, path.sensor_values, REPLICATES)
     finally:
         replicates.unstated = unstated

@@ -25,14 +25,14 @@ def after_comparison(found: Comparison, sensor: str = SENSOR, measurement: str =
                 f"take {' and '.join(found.full)} with less light: nearly all of it is full, so that it tests hardly "
                 "anything."
             )
+        few = ""
         if found.faint:
-            return (
-                f"take {' and '.join(found.faint)} for longer: so few detections are expected that only their number "
-                "was compared."
+            few = (
+                f" Of {' and '.join(found.faint)} so few detections are expected that their number alone was compared."
             )
         return (
             f"spadmnist diagnose {sensor} {measurement} gives a 95 % upper limit on each effect; a brighter, a darker "
-            "or a longer capture tests the model further."
+            f"or a longer capture tests the model further.{few}"
         )
     return f"spadmnist diagnose {sensor} {measurement} -o {out} finds what the model lacks."
 

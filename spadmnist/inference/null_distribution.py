@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 # of the range of the replicates' totals: how far beyond it they inform expectations. Farther off, where wrong models
 # had been called right, the expectation is that of the end; a rule of thumb
 _BEYOND = 1.0
-# factor on scores that are normal by themselves, least: where few detections cut their lower tail off, the replicates
-# scatter less, and the upper tail is as long as ever
-_LEAST_OF_SCORES = 1.0
+# factor on scores that are normal by themselves, least. Of one: where few detections cut its lower tail off, the
+# replicates scatter less, and the upper tail is as long as ever. Of many, some of which tell nothing; a rule of thumb
+_LEAST_OF_ONE, _LEAST_OF_SCORES = 1.0, 0.5
 # safety factor on the variance of independent squares; the ratio to it from which on values are dependent
 _SURER, _JOINED = 1.1, 1.6
 _LEAST = 1e-300  # in place of a variance of 0: near the least number of a double
@@ -223,7 +223,7 @@ def learn(summaries: Sequence[Summary], totals: np.ndarray, contrasts: np.ndarra
     z = law.of_their_own(values, fitted, spread, hat[:, None], len(coefficients))
     factor = law.factor(z)
     if first.law == "normal" and first.scale is not None and np.all(np.asarray(first.scale) == 1.0):
-        factor = max(factor, _LEAST_OF_SCORES)
+        factor = max(factor, _LEAST_OF_ONE if values.shape[1] == 1 else _LEAST_OF_SCORES)
     z = z / factor
     low, high = float(x.min()), float(x.max())
     reach = low - _BEYOND * (high - low), high + _BEYOND * (high - low)

@@ -105,7 +105,7 @@ def test_stamps_of_a_small_recording(kind: str) -> None:
     summary = reduced(Autocorrelation, recording)
     np.testing.assert_allclose(summary.values, scored(recording, pairs, chance, variance), rtol=1e-7, atol=1e-9)
     if kind == "tr":
-        assert summary.where(0) == "the same pixel, 66.8 to 83.5 ns later"
+        assert summary.where(0) == "the same pixel, 58.45 to 75.15 ns later"
     # what comes after the exposure is left out
     if kind == "dim":
         rows = [recording.events.row(p) for p in range(12)]  # type: ignore[union-attr]
