@@ -579,11 +579,11 @@ class Folder(_Source):
     With `train` and `test` folders in it these are the splits and all else is left out. Inside a split the
     first folder is the class; labels count the classes of both splits in alphabetical order. The order of the
     images is that of their paths. Hidden files and files that are not images by their suffix are left out.
-    Pixel values are taken for light as they are stored, unless `gamma: srgb` takes them back to light: half of white
-    is then 21 % of its photons, not 50 %. Transparent parts are black. EXIF orientation is ignored without `exif`,
-    colour profiles always. Pictures with palettes (GIF, some PNG) are grey where none of the folder has a colour.
-    A relative path refers to the folder of the config. --images-dir stands for the path: it is the folder, or the one
-    that a relative path refers to.
+    Pixel values are taken for light as they are stored, unless `gamma: srgb` takes them back to light: the value
+    128 then gets 22 % of white's photons, not 50 %. Transparent parts are black. EXIF orientation is ignored without
+    `exif`, colour profiles always. Pictures with palettes (GIF, some PNG) are grey where none of the folder has a
+    colour. A relative path refers to the folder of the config. --images-dir stands for the path: it is the folder, or
+    the one that a relative path refers to.
     """
 
     source: Literal["folder"] = "folder"

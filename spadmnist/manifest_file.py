@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from . import disk, store
+from . import disk, kinds, store
 from . import manifest as manifests
 from .disk import Files
 from .errors import InputError
@@ -22,7 +22,7 @@ from .store import Encoding
 
 _LARGEST_MANIFEST = 1 << 30  # bytes
 _LONGEST_SENTENCE = 600  # characters of one mistake in a manifest, which may quote endless names
-MANIFEST = "manifest.json"
+MANIFEST = kinds.MANIFEST
 CONFIG = "config.yaml"
 STATE = ".spadmnist"
 
@@ -79,7 +79,10 @@ def read_manifest(root: Path | Source) -> tuple[dict[str, Any], bool]:
 def _manifest_in(root: Path) -> bytes:
     path = root / MANIFEST
     if root.exists() and not root.is_dir():
-        raise InputError(f"{root} is no folder; a dataset is a folder (spadmnist generate makes one from a config)")
+        kind = kinds.at(root)
+        what = f"{root} is {kind}, and no folder" if kind else f"{root} is no folder"
+        more = f"; {kinds.of_data(root)}" if kinds.is_data(root) else ""
+        raise InputError(f"{what}; a dataset is a folder (spadmnist generate makes one from a config){more}")
     try:
         return disk.read_file(path, _LARGEST_MANIFEST)
     except FileNotFoundError:
@@ -89,7 +92,15 @@ def _manifest_in(root: Path) -> bytes:
             ) from None
         if not root.exists():
             raise InputError(f"{root}: there is no such folder") from None
-        raise InputError(f"{root} is not a dataset: it has no {MANIFEST}") from None
+        if kinds.at(root) == kinds.MEASUREMENT_KIND:
+            raise InputError(
+                f"{root} is a measurement and not a dataset: it has no {MANIFEST} to verify or to read; "
+                f"spadmnist inspect {quoted(root)} looks at it"
+            ) from None
+        raise InputError(
+            f"{root} is not a dataset: it has no {MANIFEST}, nor {kinds.MEASUREMENT}, which a measurement has; name a "
+            "folder that has one of them"
+        ) from None
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); spadmnist verify {quoted(root)} says more"

@@ -196,7 +196,7 @@ def write(
     """Write a sensor file with new values, and its maps into the same folder; `out`.
 
     Args:
-        source: the sensor file that was diagnosed; its comments are kept.
+        source: the sensor file that was diagnosed; its comments are kept, but for those of values that are replaced.
         values: (effect, parameter) -> number, switch, table over the wavelength or map.
         notes: what stands behind a line, as a comment.
         window: the part of the sensor that maps are of; elsewhere they are as `source` has them, or at their median
@@ -230,7 +230,7 @@ def write(
             written = {units.show(at, "m", 9): _number(declared, x) for at, x in entries}
         else:
             written = _number(declared, value)
-        edit.set((*head, effect, parameter), written)
+        edit.set((*head, effect, parameter), written, comment=False)
     for (effect, parameter), note in notes.items():
         if (effect, parameter) in values:
             edit.note((*head, effect, parameter), note)

@@ -2,7 +2,7 @@
 
 A quantity with a dimension is a number and a unit in one string; a bare number where a unit is needed is an
 error that shows what to write. A dimensionless quantity is bare or in per cent. The micro sign, as either of its two
-characters, may stand wherever a unit begins with `u`.
+characters, may stand wherever a unit begins with `u`, and `cm2` for `cm^2`: it is kept as `cm^2`.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ _QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*(\
 
 # the micro sign and the Greek letter that looks like it, where a unit begins
 _MICRO = re.compile("(?<![A-Za-z])[\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}](?=[A-Za-z])")
+_SQUARE = re.compile("(?<=m)2$")  # of a length, without its caret, where a unit ends
 
 _LONGEST = 60  # characters of a quantity
 # digits of a fitted number in a sensor file: a hundred times finer than the smallest error of a fit; a rule of thumb
@@ -115,7 +116,7 @@ def allowed_units(unit: str) -> str:
 
 def pattern(unit: str, signed: bool = True) -> str:
     """A regular expression, as JSON Schema has them, of every text that `parse` reads; signed: below 0, too."""
-    named = [re.escape(u) for u in _DIMENSIONS[unit][1] if u]
+    named = [re.escape(u).replace(r"\^", r"\^?") for u in _DIMENSIONS[unit][1] if u]
     written = "|".join(f"[u\u00b5\u03bc]{u[1:]}" if u[0] == "u" else u for u in named)
     number = r"([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?"
     return rf"^\s*{'[+-]' if signed else '[+]'}?{number}\s*({written}){'' if unit else '?'}\s*$"
@@ -136,7 +137,7 @@ def parse(value: object, unit: str) -> Quantity:
             raise ValueError(_no_unit(value, unit))
         text = repr(value)
     else:
-        text = value.strip()
+        text = _SQUARE.sub("^2", value.strip())
         if len(text) > _LONGEST:
             raise ValueError(f"{text[:20]!r}... is not {_a(name)}; write {_how(unit, sample)}")
     match = _QUANTITY.fullmatch(text)

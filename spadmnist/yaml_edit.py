@@ -36,18 +36,23 @@ class Edit:
         self._text, self._name = text, name
         self._changes: list[Callable[[Any], None]] = []
         self._notes: dict[Keys, str] = {}
+        self._gone: set[Keys] = set()
 
-    def set(self, path: Keys, value: Any) -> None:
+    def set(self, path: Keys, value: Any, comment: bool = True) -> None:
         """Set an entry, which is added where it is not there.
 
         path: keys from the top on; a group of entries on the way that is missing or empty is added, on one line.
         value: text, a number, a switch, None, or a mapping of such, which is written on one line.
+        comment: keep the comment behind its line; False: it goes with the values that it is of, where all of these are
+            replaced by others.
         """
         held = self.value
         for key in path[:-1]:
             if not isinstance(held.get(key), dict):
                 held[key] = {}
             held = held[key]
+        if not comment and path[-1] in held and held[path[-1]] != value:
+            self._gone.add(path)
         held[path[-1]] = value
         self._changes.append(lambda root: _set(root, path, value))
 
@@ -87,6 +92,7 @@ class Edit:
             root = yaml.load(text)
             _space_comments(root)
             before = _dumped(yaml, root)
+            _drop_comments(root, self._gone)
             for change in self._changes:
                 change(root)
             _put_notes(root, self._notes)
@@ -175,6 +181,32 @@ def _set(root: Any, path: Keys, value: Any) -> None:
     held[key] = _in_braces(value)
     if behind:
         _put_behind(held, key, "", behind)
+
+
+def _drop_comments(root: Any, gone: Collection[Keys]) -> None:
+    """Take away the comments behind lines of which every value goes."""
+    for path in gone:
+        held, line = root, None
+        for n, key in enumerate(path):
+            if not _is_block(held) or key not in held:
+                break
+            line, held = (held, path[: n + 1]), held[key]
+        if line is None:
+            continue
+        group, at = line
+        token = _token(group, at[-1])
+        whole = all(any(leaf[: len(one)] == one for one in gone) for leaf in _leaves(group[at[-1]], at))
+        if token is not None and whole:
+            token.value = "\n" + token.value.partition("\n")[2]
+
+
+def _leaves(held: Any, path: Keys) -> Iterator[Keys]:
+    """The paths of the values within an entry, itself where it is one."""
+    if not isinstance(held, Mapping):
+        yield path
+        return
+    for key, value in held.items():
+        yield from _leaves(value, (*path, key))
 
 
 def _put_notes(root: Any, notes: Mapping[Keys, str]) -> None:

@@ -208,6 +208,7 @@ def test_what_is_smaller_than_the_tolerance_passes_as_not_material() -> None:
     text = " ".join(table(tolerant).split())
     assert "none of" in text and "fails beyond the tolerance of 90 %" in text and "within the tolerance" in text
     assert "by more than chance, and by less than the tolerance" in text
+    assert "checks beyond the tolerance of 1 %: " in " ".join(table(replace(strict, tolerance=0.01)).split())
     assert "finds what makes these checks differ" in after_comparison(tolerant)
 
 

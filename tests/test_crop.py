@@ -597,6 +597,7 @@ def test_without_a_part_the_error_names_it(lab: Path, verb: str) -> None:
     assert done.returncode == 2 and "Traceback" not in done.stderr
     said = " ".join(done.stderr.split())
     assert "16 x 16 pixels, but the sensor 64 x 64" in said and "--crop 0:16,0:16" in said and "corner" in said
+    assert "name the sensor that recorded it" in said and "the corner 0,0 is a guess: write yours" in said
     done = commands.run(verb, "sensor.yaml", "lab", *more, "--crop", "60:76,0:16", cwd=lab)
     assert done.returncode == 2 and "the rows 60:76 reach beyond the sensor's 64 rows" in " ".join(done.stderr.split())
     assert not (lab / "never").exists() and not (lab / "never.yaml").exists()

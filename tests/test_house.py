@@ -28,7 +28,7 @@ LAYERS = [
     {"bit_planes", "disk", "estimators", "kernels", "large", "packing", "sources", "workers"},
     {"archive"},
     {"cluster", "document", "section", "plugins", "events", "image_files", "photos", "digits", "store", "tiles"},
-    {"validated", "scene", "zipped", "by_value", "yaml_edit"},
+    {"validated", "scene", "zipped", "by_value", "yaml_edit", "kinds"},
     {"effects", "readout", "remote", "images", "pictures", "positions", "window"},
     {"gather", "grids", "recording"},
     {"hooks", "reconstruct", "statistics", "capture_files"},

@@ -444,7 +444,10 @@ def test_colour_and_no_labels(tmp_path: Path) -> None:
         (["--format", "parquet", "--method", "count"], ["--method count", "counts"]),
         (["--format", "png", "--readout", "tr"], ["--readout", "flux images alone"]),
         (["--format", "webdataset", "--capture", "a"], ["--capture", "belongs to a measurement"]),
-        (["--format", "hdf5"], ["only one whose source is uniform or a chart"]),
+        (
+            ["--format", "hdf5"],
+            ["only one whose source is uniform or a chart", "take one of npz, webdataset, png, parquet"],
+        ),
         (["--format", "hdf5", "--limit", "3"], ["--limit", "gives captures"]),
     ],
 )

@@ -19,6 +19,7 @@ from spadmnist.inference import model_selection, results
 from spadmnist.inference.candidates import Candidate
 from spadmnist.inference.next_step import after_diagnosis
 from spadmnist.inference.results import Step, Value
+from spadmnist.library import answers
 from spadmnist.pages import diagnosis as page_of
 
 SENSOR = """sensor:  # the bench's
@@ -147,6 +148,13 @@ def test_a_sensor_file_that_changes_meanwhile_changes_no_answer(
     assert "pdp: 0.4" in (tmp_path / "next" / "report.html").read_text()
 
 
+def test_the_comment_of_a_value_that_is_replaced_goes_with_it(tmp_path: Path, diagnosed: Callable[..., Any]) -> None:
+    found = diagnosed(answer({RATE: 1200.0}))
+    found.save(tmp_path / "next")
+    text = (tmp_path / "next" / "sensor.yaml").read_text()
+    assert "{rate: 1.2 kHz}" in text and "of the data sheet" not in text and "# the bench's" in text
+
+
 def test_a_sensor_file_without_its_first_line_is_left_alone_beside_a_report(
     tmp_path: Path, diagnosed: Callable[..., Any]
 ) -> None:
@@ -229,6 +237,35 @@ def test_a_search_that_ended_before_any_step_does_not_speak_of_steps() -> None:
     found = answer({}, "explained", finished=False)
     found.steps = [step("per_pixel", "dark_counts", "rate")]
     assert results.sentence(found).startswith("not finished; the verdict is that of the steps so far: ")
+
+
+def test_an_answer_that_is_not_finished_begins_so() -> None:
+    ended = {"change": None, "effect": None, "parameter": None, "where": "step 1", "why": "the budget was spent"}
+    for verdict in ("unexplained", "adequate"):
+        found = answer({}, verdict, finished=False, untried=[ended])
+        assert results.table(found).startswith("NOT FINISHED: ") and verdict.upper() not in results.table(found)
+        assert results.opening(found, "Word").startswith("NOT FINISHED: ")
+    begun = "NOT FINISHED; so far: SETUP: the set-up explains"
+    assert results.table(answer({}, "setup", finished=False)).startswith(begun)
+    assert results.table(answer({}, "setup")).startswith("SETUP: the set-up explains")
+    shown = answers.Diagnosis(answer({}, "unexplained", finished=False), sp.Sensor(sp.Layout(1, 1, 1e-12, 1.0), []))
+    assert "<p>NOT FINISHED: the budget ended" in shown._repr_html_()
+
+
+def test_of_a_map_without_low_pixels_it_is_not_said_how_low_they_are() -> None:
+    change = Candidate("per_pixel", "detection", "pdp", (), carrier=("detection", "relative"))
+    values = {"sigma": Value(0.04, 0.037, 0.042), "low_fraction": Value(0.0, 0.0, 0.01)}
+    values["low_ratio"] = Value(1.0, None, None)
+
+    def said() -> str:
+        found = answer({})
+        found.steps = [Step(change, values, 1.0, 9.0, "mean of the map +1 %")]
+        return " ".join(results.table(found).split())
+
+    assert "relative spread of the bulk of the pixels: 0.04 (0.037 to 0.042)" in said()
+    assert "mean of the low ones" not in said()
+    values["low_fraction"] = Value(0.01, 0.0, 0.02)
+    assert "mean of the low ones, relative to what they are compared with: 1" in said()
 
 
 def test_the_brightest_capture_may_be_a_nonlinearity_beside_steps_as_well() -> None:

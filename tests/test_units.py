@@ -352,3 +352,14 @@ def test_what_is_rounded_to_a_thousand_is_one_of_the_next_unit() -> None:
         "999 ms",
         "1 us",
     )
+
+
+@pytest.mark.parametrize("written", [unit for unit in SIZES if "^2" in unit])
+def test_a_square_needs_no_caret_and_is_kept_with_one(written: str) -> None:
+    si, _ = SIZES[written]
+    for space in ("", " "):
+        quantity = units.parse(f" 8{space}{written.replace('^', '')}", si)
+        assert quantity.text == f"8{space}{written}" and float(quantity) == float(units.parse(f"8 {written}", si))
+        assert re.search(units.pattern(si), f"8{space}{written.replace('^', '')}")
+    refused(f"8 {written.replace('^2', '3')}", si)
+    refused("8 m2", "m")

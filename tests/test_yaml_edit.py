@@ -105,6 +105,28 @@ def test_a_comment_goes_neither_when_a_value_of_several_lines_does() -> None:
     assert edited(text, {("a", "b", "d", "g"): 7}) == text.replace("# of e\n", "# of e\n      g: 7\n")
 
 
+def test_a_comment_goes_with_the_values_that_it_is_of() -> None:
+    """Where all of these are replaced by others, and that was asked for."""
+    text = "a: {b: 1, c: 2}   # of both\n# before d\nd:\n  e: 1  # of e\n  # before f\n"
+    text += "  f:  # of f\n    g: 1  # of g\nh: 1\n"
+
+    def without(*paths: str) -> str:
+        edit = Edit(text, "a.yaml")
+        for path in paths:
+            edit.set(tuple(path), 7, comment=False)
+        return edit.text()
+
+    assert without("ab") == text.replace("b: 1", "b: 7")
+    assert without("ab", "ac") == text.replace("{b: 1, c: 2}   # of both", "{b: 7, c: 7}")
+    assert without("ai") == text.replace("c: 2}   #", "c: 2, i: 7}  #")
+    assert without("de") == text.replace("e: 1  # of e", "e: 7")
+    assert without("df") == text.replace("f:  # of f\n    g: 1  # of g", "f: 7")
+    edit = Edit(text, "a.yaml")
+    edit.set(("d", "e"), 1, comment=False)  # as it was
+    edit.note(("d", "e"), "found")
+    assert edit.text() == text.replace("# of e", "# of e  # found")
+
+
 def test_texts_of_a_name_are_mapped_wherever_they_are() -> None:
     text = "file: 'a b.npy'   # one\nx: [ {file:   c}, {file: {file: d, other: d}} ]  # file: e\nfile2: f\n"
     edit = Edit(text, "a.yaml")

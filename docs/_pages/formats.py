@@ -40,7 +40,8 @@ MEANINGS = {
     "format": "name and number of the format",
     "verdict": "`compare`: `adequate` or `fails`. `diagnose`: `adequate`, `setup`, `explained`, `confused`, "
     "`partly_explained` or `unexplained`. `fit`: `adequate`, `explained` or `partly_explained`",
-    "finished": "`false` where the budget of `--within` ended the diagnosis",
+    "finished": "`false` where the budget of `--within` ended the diagnosis, which then begins with NOT FINISHED: "
+    "`unexplained` says nothing yet",
     "misfit": "mean over (statistic, capture) of the mean squared standardised residual; 1 is the model's own scatter",
     "misfit.before": "misfit of the sensor that was given",
     "misfit.after": "misfit of the model that was found, each capture judged by parameters fitted without it",

@@ -173,6 +173,22 @@ def again(measurement: Path, plugin_files: tuple[Path, ...], crop: str | None) -
     return " ".join([quoted(measurement), *part, *(f"--plugin {quoted(file)}" for file in plugin_files)])
 
 
+def check_order(sensor: Path, measurement: Path) -> None:
+    """Raise SpadError where the measurement stands before the sensor."""
+    from .. import kinds
+    from ..errors import SpadError
+    from ..foreign import quoted
+
+    first, second = kinds.at(sensor), kinds.at(measurement)
+    swapped = first in (kinds.MEASUREMENT_KIND, kinds.DATASET_KIND) and second in (kinds.SENSOR_KIND, kinds.CONFIG_KIND)
+    if swapped:
+        verb = click.get_current_context().info_name
+        raise SpadError(
+            f"{sensor} is {first}, and {measurement} is {second}: the order is SENSOR MEASUREMENT; did you mean: "
+            f"spadmnist {verb} {quoted(measurement)} {quoted(sensor)}"
+        )
+
+
 def model_of(sensor: Path, crop: str | None) -> Sensor:
     """The sensor of a file, or the part of it that `--crop` names."""
     from .. import config, window

@@ -54,6 +54,7 @@ def compare(
     from ..errors import InputError
     from ..inference import comparison, next_step
 
+    options.check_order(sensor, measurement)
     smallest = None
     if tolerance is not None:
         try:
@@ -134,6 +135,7 @@ def diagnose(
     from ..inference import next_step, results
     from ..library.answers import ANSWER, SENSOR
 
+    options.check_order(sensor, measurement)
     if output is not None:
         disk.check_writable(output, "-o")
     _check_answer(json_file, output, *_pages(output), *([output / SENSOR] if output else []))
@@ -213,6 +215,7 @@ def fit(
     from .. import disk, library, sensor_file
     from ..inference import next_step, results
 
+    options.check_order(sensor, measurement)
     sensor_file.check_place(sensor, output)
     disk.check_writable(output, "-o")
     _check_answer(json_file, output)

@@ -81,8 +81,8 @@ def generate(
     random numbers of what is made.
 
     Your own pictures are `source: folder`; spadmnist init writes such a config. The photons of a pixel are
-    proportional to its grey level. With `gamma: srgb` the level is first converted from sRGB to linear light: half of
-    white then gets 21 % of the photons of white.
+    proportional to its grey level. With `gamma: srgb` the level is first converted from sRGB to linear light: the value
+    128 then gets 22 % of white's photons.
 
     \b
     spadmnist generate configs/quick.yaml -o out
@@ -169,7 +169,7 @@ def init(
     source is not at hand.
 
     Their JSON Schemas are written to FOLDER, too; an editor completes and checks with them. A config of pictures has
-    gamma: srgb, because pictures are not linear in the light: half of white then gets 21 % of the photons of white.
+    gamma: srgb, because pictures are not linear in the light: the value 128 then gets 22 % of white's photons.
 
     \b
     spadmnist init my --images photos --sensor spad512

@@ -106,6 +106,7 @@ def simulate(
     """
     from .. import library
 
+    options.check_order(sensor, measurement)
     with terminal.progress() as progress:
         made = library.simulate(
             sensor, measurement, seed, folder=output, crop=crop, plugins=plugin_files, progress=progress
@@ -314,6 +315,7 @@ def _by_folder(paths: Sequence[Path], out: Path) -> Iterator[str]:
 
 def _check_captures(source: Path, format_: str, choice: Any) -> None:
     """Refuse what only images of a dataset have."""
+    from .. import image_exporters
     from ..errors import SpadError
     from ..exporters import Target
     from ..measurement import is_measurement
@@ -329,4 +331,10 @@ def _check_captures(source: Path, format_: str, choice: Any) -> None:
         raise SpadError(
             f"--lux, --split, --limit, --method and several --readout: choose images of a dataset, and as {format_} "
             f"{source} gives captures; leave them out"
+        )
+    if image_exporters.is_of_images(source, image_exporters.Npz.name, image_exporters.Choice()):
+        images = ", ".join(image_exporters.ImageTarget.every)
+        raise SpadError(
+            f"--format {format_}: holds captures, and {source} is a dataset of images (only one whose source is "
+            f"uniform or a chart is a measurement, too); take one of {images}"
         )

@@ -121,8 +121,8 @@ def seconds_of(within: str | float | None, quick: bool) -> float:
         seconds = math.nan
     if not seconds > 0:
         raise InputError(
-            f"within: {within!r} is no time of more than 0; write a number and h, min or s, for example 10 min, or "
-            "none for no end"
+            f"within: {within!r} is not understood; write a number of more than 0 and its unit, h, min or s, for "
+            "example 10 min, or none for no end"
         )
     return seconds
 

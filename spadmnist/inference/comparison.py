@@ -333,8 +333,9 @@ def table(comparison: Comparison) -> str:
     """The result as text for a terminal, at most 100 characters wide: verdict, failing checks, light."""
     failing, groups, number = comparison.failing, comparison.deviations, len(comparison.checks)
     lines = []
+    beyond = "" if comparison.tolerance is None else f" beyond the tolerance of {100 * comparison.tolerance:g} %"
     if failing:
-        text = f"The model fails {len(failing)} of {number} checks: {headline(comparison)}."
+        text = f"The model fails {len(failing)} of {number} checks{beyond}: {headline(comparison)}."
         lines += textwrap.wrap(text, 100)
         if len(failing) > 1:
             lines.append("")
@@ -351,7 +352,6 @@ def table(comparison: Comparison) -> str:
         if len(groups) > LISTED:
             lines.append(f"... and {len(groups) - LISTED} more (--json FILE or -o REPORT holds all)")
     else:
-        beyond = "" if comparison.tolerance is None else f" beyond the tolerance of {100 * comparison.tolerance:g} %"
         lines.append(f"The model is adequate: none of {number} checks fails{beyond}.")
         more = sum(check.significant for check in comparison.checks)
         if more:

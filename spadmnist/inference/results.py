@@ -294,10 +294,10 @@ def canonical(found: Diagnosis) -> str:
 
 def table(found: Diagnosis) -> str:
     """The result as text for a terminal: the verdict, the steps, the ladder."""
-    lines = [*textwrap.wrap(f"{found.verdict.upper().replace('_', ' ')}: {sentence(found)}", 100), ""]
+    lines = [*textwrap.wrap(opening(found, found.verdict.upper().replace("_", " ")), 100), ""]
     for number, step in enumerate(found.steps, 1):
-        words = OF_A_MAP if step.candidate.carrier else {}
-        parts = [f"{words.get(name, name)} {shown(v)}" for name, v in step.values.items()]
+        words = {name: f"{about}:" for name, about in OF_A_MAP.items()} if step.candidate.carrier else {}
+        parts = [f"{words.get(name, name)} {shown(v)}" for name, v in told(step)]
         text = f"{number}. {title(step.candidate)}: {', '.join(parts)}; {step.significance:.1f} sigma, {step.material}"
         text += "".join(sorted({f", by {v.method}" for v in step.values.values() if v.method}))
         text += f"; {step.where}" if step.where else ""
@@ -419,6 +419,25 @@ def _limit(entry: Mapping[str, Any]) -> str:
     unit = Effect.registry.find(entry["effect"]).parameters[entry["parameter"]].unit
     limit = units.show(entry["upper_limit_95"], unit, 2) if unit else f"{entry['upper_limit_95']:.2g}"
     return f"{limit} (at least)" if entry.get("at_least") else limit
+
+
+def told(step: Step) -> list[tuple[str, Value]]:
+    """The fitted values of a step that people are told: of a map without low pixels, not how low these are."""
+    none_low = "low_fraction" in step.values and step.values["low_fraction"].value == 0
+    return [(name, v) for name, v in step.values.items() if not (none_low and name == "low_ratio")]
+
+
+def opening(found: Diagnosis, verdict: str) -> str:
+    """How an answer begins: with the verdict and its sentence; with NOT FINISHED where a budget ended the search.
+
+    Args:
+        verdict: as it is written there.
+    """
+    begun, _, rest = sentence(found).partition(": ")
+    if found.finished:
+        return f"{verdict}: {sentence(found)}"
+    begun = begun.replace("not finished", "NOT FINISHED", 1)
+    return f"{begun}: {rest}" if begun == "NOT FINISHED" else f"{begun}: {verdict}: {rest}"
 
 
 def sentence(found: Diagnosis) -> str:

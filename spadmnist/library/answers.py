@@ -378,9 +378,9 @@ class _Found:
         rows = [
             (results.title(s.candidate), name, results.shown(v), f"{s.significance:.1f}", f"{s.misfit:.4g}")
             for s in self.steps
-            for name, v in (s.values.items() or [("", Value(1.0, None, None))])
+            for name, v in (results.told(s) or [("", Value(1.0, None, None))])
         ]
-        title = f"{self.verdict.replace('_', ' ')}: {results.sentence(self.found)}"
+        title = results.opening(self.found, self.verdict.replace("_", " "))
         whole = self.found.in_sample
         if whole is not None:
             title += f" {comparison.words_in_sample(whole)}"

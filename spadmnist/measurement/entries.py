@@ -9,12 +9,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo
 
+from .. import kinds
 from ..errors import SpadError
 from ..section import Section
 from ..validated import Irradiance, Lux, Mean, Time, Uncertainty, Wavelength, brief
 
 FORMAT = "spadmnist-measurement/1"
-FILE = "measurement.yaml"
+FILE = kinds.MEASUREMENT
 
 _LONGEST = 100  # characters of a name
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .. import capture_files, disk, document, manifest, manifest_file, scene, tiles, units
+from .. import capture_files, disk, document, kinds, manifest, manifest_file, scene, tiles, units
 from ..document import Document, Path_, path_of
 from ..effects import Conditions
 from ..errors import ConfigError, InputError
@@ -55,6 +55,8 @@ def open(path: str | Path, readout: str | None = None, planned: bool = False) ->
         )
     if path.is_dir() and not file.is_file():
         raise InputError(f"{file} is no file; a measurement is described in a YAML file of that name")
+    if kinds.is_data(file):
+        raise InputError(f"{file} is no measurement: {kinds.of_data(file)}")
     return _Reader(document.read(file), folder, [], file, planned).measurement()
 
 
@@ -69,8 +71,10 @@ class _Reader(Reader):
 
     def measurement(self) -> Measurement:
         raw = self.source.value
-        if not isinstance(raw, Mapping) or not {"format", "captures", "layout"} & set(raw):
-            raise ConfigError([f"{self.source.name}: is not a measurement; it begins with {EXAMPLES['format']}"])
+        kind = kinds.described(raw)
+        if kind != kinds.MEASUREMENT_KIND and not (not kind and isinstance(raw, Mapping) and "layout" in raw):
+            this = f", and this is {kind}; name the folder or the YAML file of a measurement" if kind else ""
+            raise ConfigError([f"{self.source.name}: is not a measurement; it begins with {EXAMPLES['format']}{this}"])
         raw = {key: value for key, value in raw.items() if value is not None or key not in SECTIONS}
         parts = self.sections(raw, SECTIONS, {"name": self.base.resolve().name or "measurement"})
         layout = self.layout(parts.get("layout"), raw.get("layout"))

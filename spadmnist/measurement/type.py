@@ -168,14 +168,13 @@ class Measurement:
                 rows, columns = f"0:{mine.rows}", f"0:{mine.columns}"
                 part = (
                     f", or, where a part of the sensor was measured, say which to simulate, compare, diagnose or fit: "
-                    f"--crop {rows},{columns} (in Python sensor.cropped) if it begins at the first row and column (its "
-                    "corner must be put right)"
+                    f"--crop {rows},{columns} (in Python sensor.cropped; the corner 0,0 is a guess: write yours)"
                 )
             if mine.rows == 1 and mine.pixels == layout.pixels:
                 part = f", or import its files again with --rows {layout.rows} --columns {layout.columns}"
             raise InputError(
                 f"{self.source}: layout has {_size(mine)} pixels, but the sensor {_size(layout)}; correct one of "
-                f"them{part}"
+                f"them, or name the sensor that recorded it{part}"
             )
         theirs = layout.positions
         if mine.positions is not None and theirs is not None and not np.allclose(theirs, mine.positions, 0, 1e-9):

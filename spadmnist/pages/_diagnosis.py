@@ -117,7 +117,7 @@ def _words(found: Diagnosis, maps: Mapping[int, OddPixels]) -> dict[str, Any]:
         "kind": "Fit of a model" if found.asked == "fit" else "Diagnosis of a model",
         "verdict": word,
         "look": look,
-        "sentence": results.sentence(found),
+        "opening": results.opening(found, word),
         "then": next_step.after_diagnosis(found, new=Path(found.file).name if found.file else "next/sensor.yaml"),
         "headline": headline(found.in_sample) if found.in_sample is not None else "",
         "next": Path(found.file).name if found.file else None,
@@ -201,7 +201,7 @@ def _step(step: Step) -> _Card:
     declared = _described(step.candidate.effect)["parameters"]
     words = results.OF_A_MAP if step.candidate.carrier else {}
     numbers = []
-    for name, value in step.values.items():
+    for name, value in results.told(step):
         own = declared.get(name, {})
         about = words.get(name, own.get("about", ""))
         numbers.append(_Number(name, *_shown(value, own.get("unit", "")), about))
@@ -375,7 +375,8 @@ _TEMPLATE = """\
 {% if one.picture.note %}<p class="small">{{ one.picture.note }}</p>{% endif %}
 {% endif %}
 {% endmacro %}
-{% block title %}{{ found.sensor }} against {{ found.measurement }}: {{ verdict | lower }}{% endblock %}
+{% block title %}{{ found.sensor }} against {{ found.measurement }}: {{ "not finished, " if not found.finished }}\
+{{ verdict | lower }}{% endblock %}
 {% block kind %}{{ kind }} with a measurement{% endblock %}
 {% block style %}
 main { max-width: 1160px; }
@@ -399,7 +400,7 @@ main { max-width: 1160px; }
 {% endblock %}
 {% block body %}
 <section class="verdict {{ look }}">
-<h1>{{ verdict }}: {{ sentence }}</h1>
+<h1>{{ opening }}</h1>
 <p class="lead">{% if found.steps %}\
 The misfit on held-out data {{ "fell" if found.after < found.before else "went" }} from \
 <b>{{ found.before | number }}</b> to <b>{{ found.after | number }}</b>\
