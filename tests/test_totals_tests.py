@@ -15,6 +15,7 @@ from spadmnist.inference import comparison
 from spadmnist.inference.checks import LIGHT, block_checks
 from spadmnist.inference.evaluation import evaluate, misfits
 from spadmnist.inference.findings import remainder
+from spadmnist.inference.next_step import after_comparison
 from spadmnist.inference.null_distribution import learn, replicate_residuals
 from spadmnist.inference.replicates import TOTALS, Execution, Replicates
 from spadmnist.inference.score_test import score_test
@@ -171,3 +172,31 @@ def test_light_that_is_off_in_all_captures_is_the_set_up() -> None:
     assert found.verdict in ("setup", "confused")
     light = {entry["capture"] for entry in found.as_data()["setup"] if entry["quantity"] == "light"}
     assert light >= {f"c{k}" for k in range(5)}
+
+
+def test_a_check_that_some_simulations_have_no_data_for_is_named() -> None:
+    replicates = Replicates(SENSOR, measured({}, [0.05]), 0, Execution(Serial()), 16)
+    evaluation = evaluate(replicates, {})
+    whole = comparison.comparison_of(replicates, evaluation)
+    assert whole.not_compared == () and whole.faint == ("dark",)  # 3 dark counts are expected
+    cell = "c0", "pixel_map"
+    for of_cells in (evaluation.nulls, evaluation.judgements, evaluation.residuals, evaluation.replicate_residuals):
+        of_cells.pop(cell)  # type: ignore[attr-defined]
+    found = comparison.comparison_of(replicates, evaluation)
+    assert found.as_data()["not_compared"] == [{"statistic": "pixel_map", "capture": "c0"}]
+    assert "too few data: pixel_map of c0." in comparison.table(found)
+
+
+def test_of_a_capture_with_hardly_a_detection_the_total_alone_is_compared() -> None:
+    """Where the model expects 0.1 detections, one would be any number of sigma in every statistic."""
+    faint = sp.Sensor(SENSOR.layout, [sp.effects.Detection(pdp=0.4), sp.effects.DarkCounts(rate=5.0)], rules="device")
+    plan = [
+        sp.Capture("dark", "tr", dark=True, exposure=2.5e-3),
+        sp.Capture("flat", "tr", wavelength=500e-9, irradiance=4e-3, exposure=2.5e-3, relative_uncertainty=0.02),
+    ]
+    made = (sp.simulate(faint, plan, seed=seed) for seed in range(100))
+    data = next(lab for lab in made if lab.recording("dark").totals.sum() == 1)
+    found = comparison.compare(faint, data, 0, None, 1, 32)
+    assert found.faint == ("dark",) and found.verdict == "adequate"
+    assert {check.statistic for check in found.checks if check.capture == "dark"} == {"rate"}
+    assert "Of dark so few detections are expected" in after_comparison(found)

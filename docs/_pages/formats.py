@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import tempfile
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,9 @@ MEANINGS = {
     "unexplained": "significant residuals that no step explains: statistic, capture, place, `nearest` alternatives",
     "ladder": "misfit and errors of each model from the start on; `placebo`: an effect that was not needed",
     "advice": "captures that would separate what is confused, with the significance now and then",
+    "not_compared": "checks that were left out, because some simulations have too few data for them",
+    "not_compared[].statistic": "name of the statistic",
+    "not_compared[].capture": "name of the capture",
     "excluded": "effects that are not there, with the upper limit (95 %) of their strength; with `at_least` where an "
     "effect vanishes at the upper end of its range: then the value is at least that",
     "not_identifiable": "effects that the captures cannot show",
@@ -193,6 +197,7 @@ def answers() -> dict[str, dict[str, Any]]:
     check = Check("neighbours", "flat", 1.0, 0.5, "side neighbours", "0.2 % of detections", 0.002)
     nuisance = Nuisance(**{name: _any(one) for name, one in inspect.signature(Nuisance).parameters.items()})
     compared = Comparison("sensor", "lab", "adequate", 1.0, 1.2, (nuisance,), (check,), 100, crop="0:8,0:8")
+    compared = replace(compared, not_compared=(("frame_limits", "flat"),))
     step = Step(
         Candidate("add", "crosstalk", None, {}), {"probability": Value(0.01, 0.009, 0.011)}, 1.0, 35.0, "rate +2 %"
     )

@@ -50,6 +50,7 @@ class Comparison:
         crop: the part of the sensor that was measured: rows, columns; None for all of it.
         full: the captures of which nearly every frame or counter is full: they test hardly anything.
         faint: those with so few expected detections that only the total is compared.
+        not_compared: (statistic, capture) of what the measurement has and some simulations have too few data for.
     """
 
     sensor: str
@@ -65,6 +66,7 @@ class Comparison:
     crop: str | None = None
     full: tuple[str, ...] = ()
     faint: tuple[str, ...] = ()
+    not_compared: tuple[tuple[str, str], ...] = ()
 
     @property
     def failing(self) -> list[Check]:
@@ -99,6 +101,7 @@ class Comparison:
             "replicates": self.replicates,
             "tolerance": self.tolerance,
             **({"crop": self.crop} if self.crop else {}),
+            "not_compared": [{"statistic": name, "capture": id} for name, id in self.not_compared],
             "nuisances": [
                 {
                     "capture": n.capture,
@@ -250,6 +253,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         raise InputError(nothing_to_compare(replicates))
     checks = holm_corrected([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
     sensor = replicates.start
+    faint = [id for id, made in evaluation.made.items() if is_faint(made)]
     return Comparison(
         sensor=sensor.name,
         measurement=replicates.measurement.name,
@@ -262,7 +266,13 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         tolerance=tolerance,
         crop=str(sensor.window) if sensor.window else None,
         full=tuple(id for id, seen in replicates.seen.items() if seen.is_full(sensor)),
-        faint=tuple(id for id, made in evaluation.made.items() if is_faint(made)),
+        faint=tuple(faint),
+        not_compared=tuple(
+            (name, id)
+            for id, seen in replicates.seen.items()
+            for name in seen.summaries
+            if id in evaluation.made and id not in faint and (id, name) not in evaluation.nulls
+        ),
     )
 
 
@@ -369,6 +379,9 @@ def table(comparison: Comparison) -> str:
         f"called wrong in {100 * comparison.false_alarm_rate:.0f} % of comparisons."
     )
     lines += textwrap.wrap(about, 100)
+    if comparison.not_compared:
+        missing = listed((name, id) for name, id in comparison.not_compared)
+        lines += textwrap.wrap(f"Not compared, for some simulations have too few data: {missing}.", 100)
     for n in comparison.nuisances:
         where = n.capture or "all lit captures"
         interval = f"95 % interval {n.low:.4f} to {n.high:.4f}"
