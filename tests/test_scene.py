@@ -261,7 +261,10 @@ def test_a_plan_of_a_scene_is_filled(tmp_path: Path) -> None:
         ("image:", "is no light"),
         ("image:chart.npy dark", "is no light"),
         ("image:small.npy", "small.npy has 2 x 4 pixels, but a.npy has 3 x 4"),
-        ("image:chart.npy 80 furlongs", "is no light"),
+        ("image:chart.npy 80 furlongs", "is no light: 'furlongs' is no unit of a wavelength or of light"),
+        ("500 nm 8 uW/cmm", "'uW/cmm' is no unit of a wavelength or of light"),
+        ("500 nm 8", "'8' has no unit"),
+        ("500 nm 700 nm", "'700 nm' is not possible, or there twice"),
     ],
 )
 def test_a_scene_that_cannot_be_imported(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from dataclasses import replace
@@ -47,7 +48,7 @@ def light(text: str, relative_uncertainty: float | None = None) -> Light:
                 found[unit] = value
                 break
         else:
-            raise SpadError(f"--light: {text!r} is no light; write {_LIGHT}")
+            raise SpadError(f"--light: {text!r} is no light: {_fault(part)}; write {_LIGHT}")
     shortest, longest = units.WAVELENGTHS
     if not shortest <= found.get("m", PLAIN_COLOUR) <= longest:
         raise SpadError(
@@ -62,3 +63,18 @@ def light(text: str, relative_uncertainty: float | None = None) -> Light:
     share = 0.0 if level is None else UNCERTAIN if relative_uncertainty is None else relative_uncertainty
     lit = Light(found.get("m", PLAIN_COLOUR), level, "lux" if "lux" in found else "irradiance", share)
     return lit if shown is None else replace(lit, scene=scene.read(shown))
+
+
+def _fault(part: str) -> str:
+    """What is wrong with a part of a light, in words."""
+    number = re.match(r"[-+.0-9][-+.0-9eE]*", part)
+    if number is None:
+        return f"{part!r} is no number with a unit"
+    unit = part[number.end() :].strip()
+    if not unit:
+        return f"{part!r} has no unit"
+    for kind in ("m", "W/m^2", "lux"):
+        with contextlib.suppress(ValueError):
+            units.parse(f"1 {unit}", kind)
+            return f"{part!r} is not possible, or there twice"
+    return f"{unit!r} is no unit of a wavelength or of light, which are nm, nW/cm^2, W/m^2, lux and the like"
