@@ -26,7 +26,7 @@ from .closed_forms import CLOSED, closed_form, error_by_causes, level_for
 from .laws import poisson_scores
 from .levels import LEAST_P
 from .model_path import change_by_map
-from .pixel_maps import map_values
+from .pixel_maps import counted, map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title
 
@@ -191,7 +191,7 @@ def _answer(
     if found.p_value(_WIDER) < _SURE:  # the rates differ between blocks of time
         clear = found.significance(_WIDER)
         where = "pixels of one half of the blocks of time, by a map of the other"
-        rest.append({"statistic": "pixel_map", "capture": dark[0], "significance": clear, "where": where})
+        rest.append({"statistic": counted(), "capture": dark[0], "significance": clear, "where": where})
     right = "explained" if start.p_value() < _SURE else "adequate"
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
     step = Step(

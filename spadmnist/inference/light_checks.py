@@ -16,10 +16,10 @@ from .checks import Check
 from .levels import HALF_95
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
 from .null_distribution import p_of_largest, p_of_scatter
+from .pixel_maps import counted
 from .replicates import Cell
 from .totals_tests import Level, along, directions
 
-_MAP = "pixel_map"  # the statistic of the pixels' ratios between wavelengths
 _ENOUGH = 20.0  # expected detections of a pixel, from which on its ratio is compared; a rule of thumb
 # expectations between which slopes are interpolated; relative: how far to both sides a slope is taken
 _POINTS, _ASIDE = 64, 1e-3
@@ -37,9 +37,10 @@ def ratios_between_wavelengths(
         own: the residuals of the replicates, (replicates, cells), whose scatter pixels have together.
     """
     best: dict[float, tuple[float, Check]] = {}
+    counts = counted()
     for capture in captures:
         wave = capture.light.wavelength
-        found = next((c for c in checks if c.capture == capture.id and c.statistic == _MAP), None)
+        found = next((c for c in checks if c.capture == capture.id and c.statistic == counts), None)
         if wave is None or found is None or found.judgement is None:
             continue
         total = float(found.judgement.expected.sum())
@@ -61,7 +62,7 @@ def ratios_between_wavelengths(
             continue
         widths = [_relative_widths(check, some) for check in pair]
         each = [j.residuals[some] for j in judged]
-        replicates = [own[str(check.capture), _MAP][:, some] for check in pair]
+        replicates = [own[str(check.capture), counts][:, some] for check in pair]
         number = min(map(len, replicates))
         differences = [b * widths[1] - a * widths[0] for a, b in (each, [z[:number] for z in replicates])]
         wide = np.hypot(*widths)

@@ -25,7 +25,6 @@ from .count_model import CountModel
 from .hit_pixels import beside_maps
 from .levels import LEAST_P
 from .pixel_maps import (
-    CODES,
     GRID,
     INFORMED,
     LEAST_WIDTH,
@@ -39,6 +38,7 @@ from .pixel_maps import (
     acts_on_light,
     by_counts,
     code_periods,
+    coded,
     groups_of,
     mean_of,
     median_of,
@@ -512,7 +512,7 @@ def fit_codes(replicates: Replicates, candidate: Candidate, use: Sequence[str] =
     """
     folded: dict[int, np.ndarray] = {}
     for id, seen in replicates.seen.items():
-        summary = seen.summaries.get(CODES)
+        summary = seen.summaries.get(coded())
         if summary is None or (use and id not in use):
             continue
         for period, part in code_periods(len(summary.values)).items():

@@ -22,8 +22,9 @@ from .hit_pixels import drawn_effects
 from .levels import LEAST_EVIDENCE
 from .mixed_model import NO_PATTERN, PatternEvidence, evidence_of_scene
 from .models import Model
+from .pixel_maps import counted
 from .replicates import Replicates
-from .score_test import PIXELS, p_of_map, sigmas_of
+from .score_test import p_of_map, sigmas_of
 from .signature import Signature, residuals_at, signatures, template_of
 from .trial import Trial, is_pattern, of_scene, tie
 
@@ -177,13 +178,14 @@ def _evidence_of_scene(
     Args:
         candidate, free: the map of pixels that it is compared with, and its fit.
     """
-    ids = [id for id, name in evaluation.residuals if name == PIXELS and replicates.of_scene(id)]
+    counts = counted()
+    ids = [id for id, name in evaluation.residuals if name == counts and replicates.of_scene(id)]
     if not ids:
         return NO_PATTERN
     after = residuals_at(replicates, evaluation, one.signature, one.times)
     levels = count_model.light_levels_of(replicates, evaluation)
     information = map_models.information(replicates, evaluation.values, candidate, levels)
-    z, left = (np.stack([x[id, PIXELS] for id in ids]) for x in (evaluation.residuals, after))
+    z, left = (np.stack([x[id, counts] for id in ids]) for x in (evaluation.residuals, after))
     known = np.stack([information[id] for id in ids])
     return evidence_of_scene(z, left, known, free.sigma, len(one.candidate.coordinates))
 

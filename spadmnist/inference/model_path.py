@@ -29,7 +29,6 @@ from .phases import evaluate_start
 from .replicates import TOTALS, Cell, Replicates
 from .results import Step, title
 from .scan import Scan
-from .score_test import PIXELS
 from .signature import IGNORED, captures_showing, template_of
 from .trial import Trial
 
@@ -313,7 +312,7 @@ def _moves_no_map(path: ModelPath, best: Trial) -> bool:
             return False  # the mean of the map is that of the totals
         if candidate.per != "code" and not pixel_maps.by_counts(candidate):
             return False
-        name = pixel_maps.CODES if candidate.per == "code" else PIXELS
+        name = pixel_maps.coded() if candidate.per == "code" else pixel_maps.counted()
         known = map_models.information(replicates, evaluation.values, candidate, levels)
         most = max(float(np.mean(x)) for x in known.values())
         some = [id for id, x in known.items() if float(np.mean(x)) > _INFORMS * most]

@@ -11,6 +11,7 @@ from scipy import ndimage, special, stats
 
 from ..effects import Effect
 from ..sensor import Sensor
+from ..statistics import Statistic, informing
 from . import blind_times, mixed_model
 from .candidates import Candidate
 from .coordinates import Key
@@ -39,8 +40,6 @@ TURNS = 16  # iterations of a fit of maps: the last ones decide how near to its 
 MOST = 10.0
 # standard deviations beyond which a pixel is odd where a fit begins; of a logarithm, the width of odd pixels' prior
 ODD, WIDE = 3.5, 2.0
-CODES = "codes"  # the statistic of the codes
-_PERIODS = (256, 140, 100)  # plain meaning: the periods that `statistics.codes` folds codes with
 # the grid of log values about the middle for pixels with few counts (from, to, points): a law of width 2.3, as of dark
 # rates, is not cut off (from -4 on it was 1.9); the iterations for their law, which ends while it is smooth
 GRID, ROUNDS = (-8.0, 8.0, 129), 100
@@ -368,11 +367,21 @@ def spread_p(map_: PixelMap) -> float:
     return float(stats.chi2.sf(float(z.sum()), int(informed.sum()) - 1))
 
 
+def counted() -> str:
+    """The name of the statistic of the pixels' counts."""
+    return informing("counts")[0]
+
+
+def coded() -> str:
+    """The name of the statistic of the codes."""
+    return informing("codes")[0]
+
+
 def code_periods(cells: int) -> dict[int, slice]:
-    """The cells of the statistic `codes` that hold each period."""
+    """The cells of the statistic of the codes that hold each period."""
     out: dict[int, slice] = {}
     start = 0
-    for period in _PERIODS:
+    for period in Statistic.registry.find(coded()).periods:
         if start + period <= cells:
             out[period] = slice(start, start + period)
             start += period

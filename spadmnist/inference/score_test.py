@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from ..errors import SpadError
+from ..statistics import informing
 from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate
 from .capture_replicates import CannotSimulate
@@ -28,9 +29,6 @@ from .spectral_lines import Line
 from .statistic_maps import p_of_width
 from .trial import Trial, shape_of
 
-# statistics of the pixels' counts: each by itself, and their distribution
-PIXELS, _LAWS = "pixel_map", ("spread", "tails", "outliers")
-_EDGES = "early_intervals"  # the statistic of the differences between the pixels' dead times
 # Where no other reason stands, a value is a rule of thumb: no measurement that is kept chose it.
 # of the data's projection on a signature: as much may be the noise of a few replicates, so that a step too faint for
 # its cells must explain more than that
@@ -405,7 +403,7 @@ def p_of_map(
         return p_of_width(fitted[candidate.carrier])  # type: ignore[index]
     if candidate.blinds:
         return _p_of_blind_times(replicates, evaluation, candidate, values, information)
-    name = pixel_maps.CODES if candidate.per == "code" else PIXELS
+    name = pixel_maps.coded() if candidate.per == "code" else pixel_maps.counted()
     total_information = {id: float(x.sum()) for id, x in information.items()}
     cells = [(id, name) for id in total_information if total_information[id] > 0 and (id, name) in evaluation.residuals]
     if cells:
@@ -438,7 +436,7 @@ def p_of_map(
         return p
     # with few detections in most pixels, the distribution of the counts is more sensitive than the score of each
     best = max(total_information, key=lambda id: total_information[id])
-    laws = [(best, name) for name in _LAWS if (best, name) in evaluation.residuals]
+    laws = [(best, name) for name in informing("distribution") if (best, name) in evaluation.residuals]
     others = [evaluation.nulls[cell].p_value(evaluation.residuals[cell])[0] for cell in laws]
     return min(1.0, 2 * min([p, *(len(laws) * p for p in others)]))
 
@@ -472,7 +470,8 @@ def _p_of_blind_times(
     Args:
         information: (pixels,) by capture.
     """
-    cells = [(id, _EDGES) for id, x in information.items() if x.any() and (id, _EDGES) in evaluation.residuals]
+    every = [(id, name) for id, x in information.items() if x.any() for name in informing("dead times")]
+    cells = [cell for cell in every if cell in evaluation.residuals]
     if not cells:
         return 1.0
     try:

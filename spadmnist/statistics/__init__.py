@@ -100,6 +100,10 @@ class Statistic(Plugin, abstract=True):
     specific: ClassVar[int] = 1
     # the statistics of whose cells this one's are sums: a deviation there shows here, too (`inference.deviations`)
     pools: ClassVar[tuple[str, ...]] = ()
+    # of which maps its cells tell: the "counts" of the pixels, the "distribution" of these, "dead times" that differ
+    # from pixel to pixel, the "codes" of a converter, folded with its `periods` one after the other; "": of none
+    informs: ClassVar[Literal["", "counts", "distribution", "dead times", "codes"]] = ""
+    periods: ClassVar[tuple[int, ...]] = ()
     named_from: ClassVar[int] = 0  # a deviation in a cell before this one is no more specific than 0
     error: ClassVar[str] = ""  # the name of its `physical_error` in the error budget of a diagnosis; "": it has none
 
@@ -150,3 +154,10 @@ class Statistic(Plugin, abstract=True):
         capture (its conditions and layout) alone, never on the data.
         """
         raise NotImplementedError
+
+
+def informing(what: str) -> list[str]:
+    """The names of the statistics that declare that they inform maps of that kind, the built-in ones first."""
+    known = list(Statistic.registry)  # a plug-in may be found by this
+    first = [name for name in Statistic.registry.classes if name in known]
+    return [name for name in first if Statistic.registry.find(name).informs == what]

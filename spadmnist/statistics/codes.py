@@ -50,6 +50,8 @@ class Codes(Statistic):
     """
 
     modalities = ("tr", "str")
+    informs = "codes"
+    periods = _SHOWN
     specific = 3
     unit = "detections"
 

@@ -186,6 +186,7 @@ class EarlyIntervals(Statistic):
     """
 
     modalities = ("tr",)
+    informs = "dead times"
     specific = 2
     pools = ("edge_intervals", "pixel_map")
     among = "pixel"

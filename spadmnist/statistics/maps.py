@@ -133,6 +133,7 @@ class PixelMap(Statistic):
     """
 
     modalities = _ALL
+    informs = "counts"
     specific = 2
     unit = "1"
 
@@ -315,6 +316,7 @@ class Outliers(Statistic):
     """
 
     modalities = _ALL
+    informs = "distribution"
     pools = ("pixel_map",)
     flat = True
     unit = "1"
@@ -349,6 +351,7 @@ class Tails(Statistic):
     """
 
     modalities = _ALL
+    informs = "distribution"
     pools = ("pixel_map",)
     flat = True
     unit = "1"
@@ -384,6 +387,7 @@ class Spread(Statistic):
     """
 
     modalities = _ALL
+    informs = "distribution"
     pools = ("pixel_map",)
     flat = True
     unit = "1"
