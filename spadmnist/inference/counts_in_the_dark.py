@@ -20,13 +20,14 @@ from ..effects import Effect
 from ..errors import SpadError
 from ..measurement import Measurement
 from ..sensor import Sensor
+from ..statistics import informant
 from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .closed_forms import CLOSED, closed_form, error_by_causes, level_for
 from .laws import poisson_scores
 from .levels import LEAST_P
 from .model_path import change_by_map
-from .pixel_maps import counted, map_values
+from .pixel_maps import map_values
 from .replicates import Replicates
 from .results import Diagnosis, Step, title
 
@@ -191,7 +192,7 @@ def _answer(
     if found.p_value(_WIDER) < _SURE:  # the rates differ between blocks of time
         clear = found.significance(_WIDER)
         where = "pixels of one half of the blocks of time, by a map of the other"
-        rest.append({"statistic": counted(), "capture": dark[0], "significance": clear, "where": where})
+        rest.append({"statistic": informant("counts"), "capture": dark[0], "significance": clear, "where": where})
     right = "explained" if start.p_value() < _SURE else "adequate"
     results = {name: replace(value, method="counts") for name, value in map_values(map_).items()}
     step = Step(

@@ -12,11 +12,11 @@ from scipy import stats
 from .. import units
 from ..recording import Capture
 from ..sensor import Sensor
+from ..statistics import informant
 from .checks import Check
 from .levels import HALF_95
 from .light_levels import LEAST_ELASTICITY, CaptureNull, Nuisance
 from .null_distribution import p_of_largest, p_of_scatter
-from .pixel_maps import counted
 from .replicates import Cell
 from .totals_tests import Level, along, directions
 
@@ -37,7 +37,7 @@ def ratios_between_wavelengths(
         own: the residuals of the replicates, (replicates, cells), whose scatter pixels have together.
     """
     best: dict[float, tuple[float, Check]] = {}
-    counts = counted()
+    counts = informant("counts")
     for capture in captures:
         wave = capture.light.wavelength
         found = next((c for c in checks if c.capture == capture.id and c.statistic == counts), None)

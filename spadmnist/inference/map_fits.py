@@ -18,6 +18,7 @@ from scipy import stats
 from ..effects import Effect
 from ..errors import SpadError
 from ..sensor import Sensor
+from ..statistics import informant
 from . import blind_times
 from .candidates import Candidate, with_values
 from .coordinates import Key, Values
@@ -38,7 +39,6 @@ from .pixel_maps import (
     acts_on_light,
     by_counts,
     code_periods,
-    coded,
     groups_of,
     mean_of,
     median_of,
@@ -512,7 +512,7 @@ def fit_codes(replicates: Replicates, candidate: Candidate, use: Sequence[str] =
     """
     folded: dict[int, np.ndarray] = {}
     for id, seen in replicates.seen.items():
-        summary = seen.summaries.get(coded())
+        summary = seen.summaries.get(informant("codes"))
         if summary is None or (use and id not in use):
             continue
         for period, part in code_periods(len(summary.values)).items():

@@ -9,13 +9,14 @@ import numpy as np
 
 from ..errors import SpadError
 from ..sensor import Sensor
+from ..statistics import informant
 from . import statistic_maps
 from .candidates import Candidate, with_values
 from .coordinates import Key, Values
 from .count_model import CountModel
 from .map_fits import base_of, bounds_of, fit_maps
 from .models import Model
-from .pixel_maps import ALONE, PixelMap, coded, groups_of, spread_p
+from .pixel_maps import ALONE, PixelMap, groups_of, spread_p
 from .replicates import Replicates
 
 # p-value of a map that is needed in addition to others: the least needed one is left out above it; a rule of thumb
@@ -32,7 +33,9 @@ def information(
         levels: light level by capture.
     """
     if candidate.per == "code":
-        return {id: np.array([seen.total * (coded() in seen.summaries)]) for id, seen in replicates.seen.items()}
+        return {
+            id: np.array([seen.total * (informant("codes") in seen.summaries)]) for id, seen in replicates.seen.items()
+        }
     pixels = replicates.start.layout.pixels
     assert candidate.carrier is not None
     if candidate.informed_by:

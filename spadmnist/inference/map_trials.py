@@ -12,6 +12,7 @@ from .. import plugins
 from ..effects import Effect
 from ..errors import UNABLE
 from ..sensor import Sensor
+from ..statistics import informant
 from . import count_model, map_models, pixel_maps
 from .candidates import Candidate, with_values
 from .capture_replicates import CannotSimulate
@@ -22,7 +23,6 @@ from .hit_pixels import drawn_effects
 from .levels import LEAST_EVIDENCE
 from .mixed_model import NO_PATTERN, PatternEvidence, evidence_of_scene
 from .models import Model
-from .pixel_maps import counted
 from .replicates import Replicates
 from .score_test import p_of_map, sigmas_of
 from .signature import Signature, residuals_at, signatures, template_of
@@ -178,7 +178,7 @@ def _evidence_of_scene(
     Args:
         candidate, free: the map of pixels that it is compared with, and its fit.
     """
-    counts = counted()
+    counts = informant("counts")
     ids = [id for id, name in evaluation.residuals if name == counts and replicates.of_scene(id)]
     if not ids:
         return NO_PATTERN

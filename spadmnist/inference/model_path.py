@@ -12,6 +12,7 @@ import numpy as np
 from ..effects import ByWavelength
 from ..errors import SpadError
 from ..sensor import Sensor
+from ..statistics import informant
 from ..units import rounded
 from . import count_model, held_out, map_models, pixel_maps
 from .candidates import Candidate, with_values
@@ -312,7 +313,7 @@ def _moves_no_map(path: ModelPath, best: Trial) -> bool:
             return False  # the mean of the map is that of the totals
         if candidate.per != "code" and not pixel_maps.by_counts(candidate):
             return False
-        name = pixel_maps.coded() if candidate.per == "code" else pixel_maps.counted()
+        name = informant("codes") if candidate.per == "code" else informant("counts")
         known = map_models.information(replicates, evaluation.values, candidate, levels)
         most = max(float(np.mean(x)) for x in known.values())
         some = [id for id, x in known.items() if float(np.mean(x)) > _INFORMS * most]

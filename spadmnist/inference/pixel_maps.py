@@ -11,7 +11,7 @@ from scipy import ndimage, special, stats
 
 from ..effects import Effect
 from ..sensor import Sensor
-from ..statistics import Statistic, informing
+from ..statistics import Statistic, informant
 from . import blind_times, mixed_model
 from .candidates import Candidate
 from .coordinates import Key
@@ -367,21 +367,11 @@ def spread_p(map_: PixelMap) -> float:
     return float(stats.chi2.sf(float(z.sum()), int(informed.sum()) - 1))
 
 
-def counted() -> str:
-    """The name of the statistic of the pixels' counts."""
-    return informing("counts")[0]
-
-
-def coded() -> str:
-    """The name of the statistic of the codes."""
-    return informing("codes")[0]
-
-
 def code_periods(cells: int) -> dict[int, slice]:
     """The cells of the statistic of the codes that hold each period."""
     out: dict[int, slice] = {}
     start = 0
-    for period in Statistic.registry.find(coded()).periods:
+    for period in Statistic.registry.find(informant("codes")).periods:
         if start + period <= cells:
             out[period] = slice(start, start + period)
             start += period

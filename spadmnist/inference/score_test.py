@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from ..errors import SpadError
-from ..statistics import informing
+from ..statistics import informant, informing
 from . import count_model, map_fits, map_models, pixel_maps
 from .candidates import Candidate
 from .capture_replicates import CannotSimulate
@@ -403,7 +403,7 @@ def p_of_map(
         return p_of_width(fitted[candidate.carrier])  # type: ignore[index]
     if candidate.blinds:
         return _p_of_blind_times(replicates, evaluation, candidate, values, information)
-    name = pixel_maps.coded() if candidate.per == "code" else pixel_maps.counted()
+    name = informant("codes") if candidate.per == "code" else informant("counts")
     total_information = {id: float(x.sum()) for id, x in information.items()}
     cells = [(id, name) for id in total_information if total_information[id] > 0 and (id, name) in evaluation.residuals]
     if cells:

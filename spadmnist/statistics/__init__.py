@@ -161,3 +161,8 @@ def informing(what: str) -> list[str]:
     known = list(Statistic.registry)  # a plug-in may be found by this
     first = [name for name in Statistic.registry.classes if name in known]
     return [name for name in first if Statistic.registry.find(name).informs == what]
+
+
+def informant(what: str) -> str:
+    """The name of the first statistic that declares that it informs maps of that kind; see `informing`."""
+    return informing(what)[0]
