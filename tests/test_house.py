@@ -401,3 +401,10 @@ def test_no_result_of_the_inference_is_built_by_place(file: str) -> None:
     """A field that is added or moved would go to the wrong place without a word."""
     found = [f"{file}:{line} {name}" for line, name in built_by_place(file)]
     assert not found, "four or more arguments without a name: " + ", ".join(found)
+
+
+@pytest.mark.parametrize("entry", ["comparison", "model_selection", "named_fit"])
+def test_what_a_verb_begins_with_can_be_imported_first(entry: str) -> None:
+    """In a process of its own: in this one the modules are there, in an order that hides a circle."""
+    done = subprocess.run([sys.executable, "-c", f"import spadmnist.inference.{entry}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -474,7 +474,7 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     (step,), evaluation = path.steps, path.evaluation
     step.alternatives = [{"confused": rival}]
     path.rung("+ another dead time")
-    rows = [rung.row for rung in path.ladder]
+    rows = [(rung.model, rung.misfit) for rung in path.ladder]
     usual, fit = dict(step.values), path.values[DURATION]
     check = SimpleNamespace(cell=("flat", "edge_intervals"))
     monkeypatch.setattr(ModelPath, "failed", property(lambda self: [] if self.evaluation is evaluation else [check]))
@@ -485,5 +485,5 @@ def test_a_likelihood_of_one_of_two_laws_that_are_as_good_decides_nothing(lab, m
     assert (step.values == usual) == rival
     assert path.values[DURATION] == (fit if rival else 50e-9) and fit != 50e-9
     path.last_rung()  # and the ladder ends with the model as it is now
-    assert ([rung.row for rung in path.ladder] == rows) == rival and len(path.ladder) == len(rows)
+    assert ([(rung.model, rung.misfit) for rung in path.ladder] == rows) == rival and len(path.ladder) == len(rows)
     assert path.ladder[-1].model == "+ another dead time" and path.ladder[-1].misfit == path.misfit

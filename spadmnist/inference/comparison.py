@@ -27,7 +27,7 @@ from .captures_together import Together, checks_together
 from .checks import Check, holm
 from .coordinates import Values
 from .deviations import LISTED, Deviation, deviations, excess, listed
-from .evaluation import Evaluation, is_faint, mean_misfit, misfit_null_95, misfits
+from .evaluation import Evaluation, faint_captures, mean_misfit, misfit_null_95, misfits
 from .levels import FALSE_ALARM, LEAST_P, SHARES
 from .light_checks import level_checks, light_of, ratios_between_wavelengths
 from .light_levels import Nuisance
@@ -253,7 +253,7 @@ def comparison_of(replicates: Replicates, evaluation: Evaluation, tolerance: flo
         raise InputError(nothing_to_compare(replicates))
     checks = holm_corrected([replace(c, p_value=max(c.p_value, LEAST_P)) for c in checks], tolerance)
     sensor = replicates.start
-    faint = [id for id, made in evaluation.made.items() if is_faint(made)]
+    faint = [id for id in replicates.seen if id in faint_captures(replicates)]
     return Comparison(
         sensor=sensor.name,
         measurement=replicates.measurement.name,

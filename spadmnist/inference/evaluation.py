@@ -16,7 +16,16 @@ from .candidates import with_values
 from .capture_replicates import CannotSimulate, CaptureReplicates, joined
 from .closed_forms import most_detections
 from .coordinates import Key, Values
-from .light_levels import CaptureNull, central_level, law_of, levels_about, matched_light, own_totals, totals_residuals
+from .light_levels import (
+    CaptureNull,
+    central_level,
+    law_of,
+    levels_about,
+    matched_light,
+    own_totals,
+    totals_residuals,
+    whole_of,
+)
 from .mean_alone import of_mean
 from .models import Model
 from .null_distribution import Judgement, Null, learn, replicate_residuals, scatter_of
@@ -224,7 +233,7 @@ def _evaluate(
             level=centre, stated=stated, totals=made.totals, expected=expected, law=law, scatter=scatter, most=most
         )
         evaluation.factors[id] = factors
-        if is_faint(made):
+        if whole_of(replicates, id) in faint_captures(replicates):
             continue  # replicates without a detection are all alike: one detection would be any number of sigma
         for name, summary in replicates.seen[id].summaries.items():
             if name not in made.values:
@@ -244,9 +253,18 @@ def _evaluate(
     return evaluation
 
 
-def is_faint(made: CaptureReplicates) -> bool:
-    """Whether the replicates of a capture have so few detections that its total alone is compared."""
-    return float(made.totals.mean()) < _FEW_DETECTIONS
+def faint_captures(replicates: Replicates) -> frozenset[str]:
+    """The captures of which the stated model expects so few detections that the total alone is compared.
+
+    They are the same for all models that are compared with the stated one. Many detections are as many replicates.
+    """
+    if replicates.faint is None:
+        start = Model.same(replicates.start)
+        reduced = {id: seen for id, seen in replicates.seen.items() if seen.summaries}
+        levels = {id: central_level(replicates, start.mean_sensor(id), seen) for id, seen in reduced.items()}
+        found = (id for id, (level, _, expected, _) in levels.items() if expected(level) < _FEW_DETECTIONS)
+        replicates.faint = frozenset(whole_of(replicates, id) for id in found)
+    return replicates.faint
 
 
 def _compare_totals(replicates: Replicates, evaluation: Evaluation, number: int) -> None:

@@ -172,6 +172,7 @@ class Replicates:
         self.simulations = 0
         # captures whose stated level is wrong, as the set-up explains the totals: their totals are not compared
         self.unstated: frozenset[str] = frozenset()
+        self.faint: frozenset[str] | None = None  # see `evaluation.faint_captures`
         self._reported: set[int] = set()  # numbers of workers that were reported
         for capture in measurement.captures:
             if capture.mean is not None:
@@ -210,7 +211,7 @@ class Replicates:
         own, number = sensor.resolved(), number or self.number
         if (own.nominal_dead_time, own.tick) == (self.dead, self.start.tick):  # what the reduction takes of a sensor
             other = copy.copy(self)
-            other.start, other.simulations, other.number = own, 0, number
+            other.start, other.simulations, other.number, other.faint = own, 0, number, None
             return other
         by = Execution(
             workers=self.workers, say=self.say, progress=self.progress, budget=self.budget, journal=self.journal
