@@ -11,8 +11,8 @@ from spadmnist.inference.evidence import evaluation_of
 from spadmnist.inference.joint_fit import complete_fit, completed
 from spadmnist.inference.model_path import begin
 from spadmnist.inference.replicates import TOTALS
-from spadmnist.inference.score_test import PIXELS
 from spadmnist.inference.signature import Sampling, Signature, captures_informing, signatures, statistics_showing
+from spadmnist.statistics import informant
 
 RATE = ("dark_counts", "rate")
 
@@ -106,10 +106,10 @@ def test_the_statistics_and_captures_that_show_a_trial(lab) -> None:
     base = evaluate(replicates, {})
     template = {cell: np.zeros(len(z)) for cell, z in base.residuals.items()}
     assert statistics_showing(template, 0.01) == [] == captures_informing(replicates, base, template)
-    template["dark", "intervals"][0], template["flat", PIXELS][0] = 10.0, 2.0
-    assert statistics_showing(template, 0.01, 4.0) == [PIXELS, "intervals"]
+    template["dark", "intervals"][0], template["flat", informant("counts")][0] = 10.0, 2.0
+    assert statistics_showing(template, 0.01, 4.0) == [informant("counts"), "intervals"]
     assert statistics_showing(template, 0.2) == ["intervals"]
     # the dark capture has few detections and most of the square
     assert captures_informing(replicates, base, template) == ["dark"]
-    template["flat", PIXELS][0] = 12.0
+    template["flat", informant("counts")][0] = 12.0
     assert set(captures_informing(replicates, base, template)) == {"dark", "flat"}

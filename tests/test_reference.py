@@ -11,7 +11,7 @@ import pytest
 
 from spadmnist import config, document, plugins, reference
 from spadmnist.effects import STAGES, Effect
-from spadmnist.inference import comparison
+from spadmnist.inference import comparison, light_checks
 from spadmnist.inference.levels import FALSE_ALARM, SHARE_OF_STATISTICS, SHARES
 from spadmnist.reconstruct import Method
 from spadmnist.statistics.checks import Check
@@ -201,7 +201,8 @@ def test_every_method_is_listed() -> None:
 
 def test_every_name_that_a_comparison_gives_a_check_is_explained() -> None:
     """The names are read off the code that makes the checks; the shares of false alarms are those that it takes."""
-    names = set(re.findall(r'Check\(\s*(?:statistic=)?"(\w+)"', inspect.getsource(comparison))) | set(SHARES)
+    source = inspect.getsource(comparison) + inspect.getsource(light_checks)
+    names = set(re.findall(r'Check\(\s*(?:statistic=)?"(\w+)"', source)) | set(SHARES)
     assert names == set(Check.registry)
     listed = reference.statistic_list()
     for name in names:
