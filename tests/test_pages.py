@@ -478,6 +478,14 @@ def test_the_picture_of_the_light_shows_what_is_stated(uncertainty: float, shift
     assert f"within {196 * uncertainty:.2g} %".encode() in data
 
 
+def test_what_was_not_compared_is_there(tmp_path: Path) -> None:
+    _, parts = written(replace(adequate(), not_compared=(("frame_limits", "flat"),), faint=("dark",)), tmp_path)
+    assert "frame_limits of flat: some simulations have too few data for that" in parts.text
+    assert "dark: so few detections are expected" in parts.text
+    _, parts = written(adequate(), tmp_path / "whole")
+    assert "not compared" not in parts.text and "by number alone" not in parts.text
+
+
 def test_many_lights_are_a_picture_of_the_oddest(tmp_path: Path) -> None:
     many = [Nuisance(f"flat-{k}", "light", 1.0, 0.99, 1.01, k / 100) for k in range(150)]
     picture = _comparison._light_picture([Nuisance(None, "light", 1.0, 0.99, 1.01, 0.0), *many])

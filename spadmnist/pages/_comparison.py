@@ -315,6 +315,11 @@ lines. A ring marks where the residual is largest.</p>
 <dt>captures</dt><dd>{{ captures | length }}{% if captures %}: {{ captures[:40] | join(", ") }}\
 {{ ", ..." if captures | length > 40 }}{% endif %}</dd>
 <dt>checks</dt><dd>{{ found.checks | length }}, of {{ statistics | length }} kinds</dd>
+{% if found.not_compared %}<dt>not compared</dt><dd>{% for name, id in found.not_compared %}{{ name }} of {{ id }}\
+{{ ", " if not loop.last }}{% endfor %}: some simulations have too few data for that</dd>
+{% endif %}\
+{% if found.faint %}<dt>by number alone</dt><dd>{{ found.faint | join(", ") }}: so few detections are expected</dd>
+{% endif %}\
 <dt>simulations</dt><dd>{{ found.replicates }} of each capture, with as many detections as were measured</dd>
 <dt>false alarms</dt><dd>a right model is called wrong in {{ found.false_alarm_rate | percent }} of comparisons</dd>
 <dt>tolerance</dt><dd>{% if found.tolerance is none %}none: whatever differs by more than chance counts\
