@@ -247,7 +247,7 @@ def note(root: Path, shard: Shard, files: Files, facts: Facts | None = None) -> 
 
 @contextlib.contextmanager
 def locked(root: Path, part: Part | None = None) -> Iterator[None]:
-    """Hold the dataset for writing: alone, or one part of it beside other parts, of which a leaving one is waited for.
+    """Hold the dataset for writing: alone, or one part of it among others. A part that is just ending is waited for.
 
     The system frees the locks of a process that is killed. Raises SpadError where another run holds them.
     """

@@ -586,7 +586,7 @@ class Simulated(Dataset[Any]):
         transform: called with the events of an image; for "tr" alone.
 
     Raises:
-        SpadError: for arguments that are not possible, or mean nothing beside the others, for images of another size
+        SpadError: for arguments that are not possible, or do not apply with the others, for images of another size
             than the sensor's, and for an image that is asked for a second time in one epoch.
     """
 
@@ -762,7 +762,7 @@ def _asked_for(returns: str, recording: Mapping[str, Any]) -> tuple[str | None, 
             f"recording: its readouts are {', '.join(map(str, listed))}, but returns={returns!r}{why} needs "
             f"{', '.join(lacking)}; add it to them, or leave readouts out"
         )
-    return method, listed or given  # what is no list of readouts is told of where a config is read
+    return method, listed or given  # the config reader refuses what is no list of readouts
 
 
 class _Shown(NamedTuple):

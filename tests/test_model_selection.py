@@ -258,6 +258,23 @@ def test_a_step_is_judged_by_its_own_cells_alone(lab):
     assert left_in_own_cells(faint, {own: np.array([0.0, 0.0]), other: np.full(50, 0.9)}, True) < 0
 
 
+def test_what_fails_in_other_captures_takes_no_step_of_totals_away(lab):
+    """A total is judged as other cells are where nothing else fails in its capture; else that may be its cause."""
+    step = Step(
+        candidate=next(c for c in candidates(lab()[0]) if c.name == "set dark_counts.rate"),
+        values={},
+        misfit=1.0,
+        significance=26.0,
+        material="",
+        template={TOTALS: np.array([26.0, 0.0]), ("flat", "pixel_map"): np.full(4, 0.1)},
+        before={TOTALS: np.array([26.2, 0.3]), ("flat", "pixel_map"): np.full(4, 8.0)},
+    )
+    after = {TOTALS: np.array([0.1, 0.3]), ("flat", "pixel_map"): np.full(4, 8.0)}
+    assert left_in_own_cells(step, after, True, totals_alone=True) < 0
+    assert left_in_own_cells(step, after, True, totals_alone=False) == math.inf
+    assert left_in_own_cells(step, step.before, True, totals_alone=True) == math.inf  # it explains nothing
+
+
 # --- what looks the same -----------------------------------------------------------------------------------------
 
 

@@ -55,7 +55,7 @@ class Coordinate:
         """Whether the parameter has whole values only, or whole multiples and whole parts of what is listed."""
         return self.kind == "count" or (self.kind == "multiple" and bool(self.off))
 
-    def beside(self, value: float, by: int) -> float:
+    def next_whole(self, value: float, by: int) -> float:
         """The whole value that is so many further up, or down where negative, in the parameter's unit."""
         if self.kind == "count":
             return value + by

@@ -311,7 +311,7 @@ def left_in_own_cells(
     own = order[: int(np.searchsorted(np.cumsum(score[order]), OWN_CELLS * score.sum())) + 1]
     # the fall of a faint one is in all of its cells; in the others, another step may have made it a rise
     explained = max(float(fell.sum()), float(fell[own].sum()))
-    # of totals beside other traces, what those are of may be the cause
+    # the cause of another trace in these captures may be the cause of their totals
     if explained < LEAST_EVIDENCE or score[shapes].sum() < 0.5 * score.sum():
         return math.inf
     left, excess = float(np.mean(now[own] ** 2)) - 1, float(np.mean(before[own] ** 2)) - 1

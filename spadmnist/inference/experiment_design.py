@@ -35,7 +35,7 @@ _MOST_EVENTS = 6e5  # detections of a longer capture, at most; a brighter one ma
 _LONG = 100.0  # s of a long dark capture
 _LONGER = 10.0  # factor on the exposure of a lit capture that is taken again, at most
 _LEAST_COUNTS = 0.5  # detections: the least variance of a count, where captures are compared; a rule of thumb
-_CALIBRATED = 1e-3  # relative: how well the light of a further capture is known beside the first; a rule of thumb
+_CALIBRATED = 1e-3  # relative: the error of the ratio of two captures' light levels; a rule of thumb
 _MOST_FRAMES = 4.0  # the same for frames, which cost time even where they are empty
 
 

@@ -360,8 +360,8 @@ def fit_whole_number(
             step *= 2
     out = [x for x, square in squares.items() if square > excluded]
     # a range may end between two whole numbers
-    low = min(max((coordinate.beside(x, 1) for x in out if x < here), default=coordinate.low), here)
-    high = max(min((coordinate.beside(x, -1) for x in out if x > here), default=coordinate.high), here)
+    low = min(max((coordinate.next_whole(x, 1) for x in out if x < here), default=coordinate.low), here)
+    high = max(min((coordinate.next_whole(x, -1) for x in out if x > here), default=coordinate.high), here)
     ends = {coordinate.key: (low, high)}
     for i, other in enumerate(found.coordinates):
         intervals = [
@@ -387,5 +387,5 @@ def _variance_inflation(fit: Fit) -> float:
 def _neighbour(coordinate: Coordinate, value: float, step: float) -> float:
     """The whole number at this distance in the logarithm, at least the next one; within its range."""
     other = coordinate.value(coordinate.coordinate(value) + step)
-    other = min(other, coordinate.beside(value, -1)) if step < 0 else max(other, coordinate.beside(value, 1))
+    other = min(other, coordinate.next_whole(value, -1)) if step < 0 else max(other, coordinate.next_whole(value, 1))
     return min(max(other, coordinate.low), coordinate.high)
